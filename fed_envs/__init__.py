@@ -1,0 +1,1 @@
+"""Heterogeneous client environments for federated reinforcement learning."""

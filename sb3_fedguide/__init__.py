@@ -1,0 +1,1 @@
+"""Federated reinforcement learning for Stable-Baselines3."""

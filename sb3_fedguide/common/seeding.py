@@ -1,0 +1,26 @@
+"""What each random stream of a federation is for. A stream's key is ``(role, client_id, ...)``."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from fed_envs.seeding import integer_seed, seed_sequence, stream
+
+__all__ = ["Role", "integer_seed", "seed_sequence", "stream"]
+
+
+class Role(IntEnum):
+    """First part of a stream's key; the numbers are part of what a seed means, so they never change."""
+
+    TRAIN_ENV = 0
+    EVAL_ENV = 1
+    INIT = 2
+    ACTION = 3
+    MINIBATCH = 4
+    PRIOR = 5
+    DATA = 6
+    BEHAVIOR_CLONING = 7
+    TRUNK = 8
+    HEAD = 9
+    DICE = 10
+    SERVER = 11

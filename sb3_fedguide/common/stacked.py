@@ -1,0 +1,65 @@
+"""N networks of one architecture as a single module: every parameter has a leading client dimension.
+
+One batched matrix product serves all clients, and client k's slice of the state dict is the state dict of an ordinary network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch as th
+from torch import nn
+
+
+class StackedLinear(nn.Module):
+    """N affine maps ``y_k = x_k W_k^T + b_k``.
+
+    :param weight: shape ``(n_clients, out_features, in_features)``
+    :param bias: shape ``(n_clients, out_features)``
+    """
+
+    def __init__(self, weight: th.Tensor, bias: th.Tensor) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(weight)
+        self.bias = nn.Parameter(bias)
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """:param x: ``(n_clients, batch, in_features)``
+        :return: ``(n_clients, batch, out_features)``
+        """
+        if self.weight.shape[1] == 1:
+            # A batched product with one output column takes another kernel for one client than for several, and the
+            # clients' results would then depend on their number in the last bit.
+            return (x * self.weight).sum(dim=-1, keepdim=True) + self.bias.unsqueeze(1)
+        return th.baddbmm(self.bias.unsqueeze(1), x, self.weight.transpose(1, 2))
+
+    def extra_repr(self) -> str:
+        n_clients, out_features, in_features = self.weight.shape
+        return f"n_clients={n_clients}, in_features={in_features}, out_features={out_features}"
+
+
+def stack_module(module: nn.Module, n_clients: int) -> nn.Module:
+    """A module that holds ``n_clients`` copies of ``module``, with the same parameter names.
+
+    :param module: built of ``nn.Sequential``, ``nn.Linear`` and parameter-free modules (activations)
+    :raises TypeError: for a module with parameters that is neither
+    """
+    if isinstance(module, nn.Linear):
+        if module.bias is None:
+            raise TypeError("stack_module needs nn.Linear layers with a bias")
+        return StackedLinear(stack_tensor(module.weight, n_clients), stack_tensor(module.bias, n_clients))
+    if isinstance(module, nn.Sequential):
+        return nn.Sequential(*(stack_module(child, n_clients) for child in module))
+    if next(module.parameters(), None) is not None:
+        raise TypeError(f"stack_module cannot stack {type(module).__name__}: only Sequential, Linear and activations")
+    return module
+
+
+def stack_tensor(tensor: th.Tensor, n_clients: int) -> th.Tensor:
+    """``n_clients`` copies of ``tensor`` along a new leading dimension, detached from it."""
+    return tensor.detach().unsqueeze(0).repeat(n_clients, *([1] * tensor.dim())).contiguous()
+
+
+def client_state(state: Mapping[str, th.Tensor], index: int) -> dict[str, th.Tensor]:
+    """Client ``index``'s part of a stacked state dict, copied: the state dict of an ordinary, unstacked network."""
+    return {name: tensor[index].detach().clone() for name, tensor in state.items()}
