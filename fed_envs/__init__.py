@@ -1,1 +1,45 @@
-"""Heterogeneous client environments for federated reinforcement learning."""
+"""Heterogeneous client environments for federated reinforcement learning.
+
+Importing this package registers one Gymnasium id per family, ``fed_envs/<Family>-v0``::
+
+    import gymnasium
+    import fed_envs
+
+    env = gymnasium.make("fed_envs/HopperHard-v0", client=3)     # one client's MDP
+    clients = fed_envs.FederatedVecEnv("HopperHard")             # all clients side by side, a Stable-Baselines3 VecEnv
+
+The import is light: the simulator, pydantic and Stable-Baselines3 are loaded when the first of their names is used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from fed_envs.registration import FAMILIES, register_families
+
+if TYPE_CHECKING:
+    from fed_envs.metadata import Client, Family, load_family
+    from fed_envs.vec_env import FederatedVecEnv
+
+__all__ = ["FAMILIES", "Client", "Family", "FederatedVecEnv", "load_family"]
+
+_LAZY = {
+    "Client": "fed_envs.metadata",
+    "Family": "fed_envs.metadata",
+    "load_family": "fed_envs.metadata",
+    "FederatedVecEnv": "fed_envs.vec_env",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LAZY[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})
+
+
+register_families()

@@ -1,1 +1,50 @@
-"""Federated reinforcement learning for Stable-Baselines3."""
+"""Federated reinforcement learning for Stable-Baselines3: FedGuide, its baselines, and a Local control.
+
+    from sb3_fedguide import FedGuide
+
+    model = FedGuide("MlpPolicy", "HopperHard", seed=0, tensorboard_log="runs")
+    model.learn(total_timesteps=100 * 8 * 4096, progress_bar=True)
+    model.client(3)    # client 3 as an ordinary stable_baselines3.PPO
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_fedguide.algorithms.fedavg import FedAvg
+    from sb3_fedguide.algorithms.fedguide import FedGuide, FedGuideA, FedGuideP
+    from sb3_fedguide.algorithms.local import Local
+    from sb3_fedguide.common.evaluation import FederatedEvalCallback, evaluate_federation
+    from sb3_fedguide.common.federated_ppo import FederatedPPO
+
+_LAZY = {
+    "FedAvg": "sb3_fedguide.algorithms.fedavg",
+    "FedGuide": "sb3_fedguide.algorithms.fedguide",
+    "FedGuideA": "sb3_fedguide.algorithms.fedguide",
+    "FedGuideP": "sb3_fedguide.algorithms.fedguide",
+    "Local": "sb3_fedguide.algorithms.local",
+    "FederatedEvalCallback": "sb3_fedguide.common.evaluation",
+    "FederatedPPO": "sb3_fedguide.common.federated_ppo",
+    "evaluate_federation": "sb3_fedguide.common.evaluation",
+}
+
+__version__ = "0.1.0"
+__all__ = [
+    "FedAvg",
+    "FedGuide",
+    "FedGuideA",
+    "FedGuideP",
+    "FederatedEvalCallback",
+    "FederatedPPO",
+    "Local",
+    "__version__",
+    "evaluate_federation",
+]
+
+
+def __getattr__(name: str) -> Any:  # torch and SB3 are imported when one of them is first used
+    if name in _LAZY:
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

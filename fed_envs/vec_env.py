@@ -1,0 +1,284 @@
+"""All clients of a family side by side, as one Stable-Baselines3 ``VecEnv``."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from fed_envs.metadata import Family, load_family
+from fed_envs.registration import environment_class
+from fed_envs.seeding import integer_seed
+from fed_envs.world import Batch, Runner, run_here
+
+EnvFactory = Callable[[], gymnasium.Env]
+
+
+class FactoryBatch(Batch[Any]):
+    """Environments of the user's own, stepped one by one; their truncations are theirs to say."""
+
+    def __init__(self, envs: Sequence[gymnasium.Env]) -> None:
+        super().__init__(envs)  # type: ignore[arg-type]
+        self._infos: list[dict[str, Any]] = [{} for _ in envs]
+
+    def step(self, actions: np.ndarray, rows: Sequence[int], run: Runner = run_here) -> None:
+        for row in rows:
+            result = self.envs[row].step(actions[row])
+            self.observations[row], self.rewards[row], self.terminated[row], self.truncated[row], self._infos[row] = result
+
+    def info(self, row: int) -> dict[str, Any]:
+        return dict(self._infos[row])
+
+    def infos(self) -> list[dict[str, Any]]:
+        return [dict(info) for info in self._infos]
+
+
+class FederatedVecEnv(VecEnv):
+    """The clients of a family, some copies of each, stepped together.
+
+    Environments are ordered client by client: index = position in ``client_ids`` * ``n_envs_per_client`` + copy. Each has its
+    own random stream, so that a client's trajectory does not depend on who else is here. Finished environments are reset at
+    once, as SB3 expects; ``infos[i]`` of a finished one has ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``
+    (``r`` return, ``l`` length, ``t`` seconds since the start, as of ``Monitor``). The info of an unfinished one is empty:
+    filling it would cost more than the arithmetic of the step.
+
+    It pickles and copies with the state of simulators and random streams, so that a copy goes on exactly like the original.
+
+    :param family: a family's name, the path of a metadata file, a :class:`fed_envs.Family`, or a list of functions that make
+        an environment, one per client (those are stepped one by one, and their infos are passed on)
+    :param n_envs_per_client: copies of each client's environment
+    :param clients: ids of the clients that live here; all by default
+    :param num_threads: threads that step the simulators; the result does not depend on it
+    :param role: which of a federation's random streams to use (training, evaluation, ...), see :meth:`seed`
+    :param render_mode: ``"rgb_array"`` or ``"human"``
+    :raises ValueError: for unknown families and clients, and for environments whose spaces differ
+    """
+
+    def __init__(
+        self,
+        family: str | os.PathLike[str] | Family | Sequence[EnvFactory],
+        n_envs_per_client: int = 1,
+        clients: Sequence[int] | None = None,
+        num_threads: int = 1,
+        role: int = 0,
+        render_mode: str | None = None,
+    ) -> None:
+        if n_envs_per_client < 1:
+            raise ValueError(f"n_envs_per_client must be at least 1, got {n_envs_per_client}")
+        if num_threads < 1:
+            raise ValueError(f"num_threads must be at least 1, got {num_threads}")
+        self.family: Family | None = None
+        if isinstance(family, (str, os.PathLike, Family)):
+            self.family = load_family(family)
+            self.name = self.family.name
+            make = environment_class(self.family.world)
+            factories: list[EnvFactory] = [
+                lambda client=client: make(client=client, metadata=self.family, render_mode=render_mode)  # type: ignore[misc]
+                for client in range(self.family.n_clients)
+            ]
+        else:
+            self.name, factories = "custom", list(family)
+            if not factories or not all(callable(factory) for factory in factories):
+                raise ValueError("a list of environments must have one function per client, each returning a new environment")
+            if render_mode is not None:
+                raise ValueError("environments from functions bring their own render_mode; give it there")
+        self.client_ids = _checked_clients(clients, len(factories), self.name)
+        self.n_clients = len(self.client_ids)
+        self.n_envs_per_client = n_envs_per_client
+        self.num_threads = num_threads
+        self.role = role
+        self.envs: list[gymnasium.Env] = [factories[k]() for k in self.client_ids for _ in range(n_envs_per_client)]
+        if len({id(env.unwrapped) for env in self.envs}) != len(self.envs):
+            raise ValueError("each function must return a new environment at every call, not the same one again")
+        _check_spaces(self.envs)
+        super().__init__(len(self.envs), self.envs[0].observation_space, self.envs[0].action_space)
+        self._active = np.ones(self.num_envs, dtype=bool)
+        self._lengths = np.zeros(self.num_envs, dtype=np.int64)
+        self._returns = np.zeros(self.num_envs)
+        self._max_steps = self.family.max_episode_steps if self.family is not None else sys.maxsize
+        self._actions: np.ndarray | None = None
+        self._start_time = time.time()
+        self._pool: ThreadPoolExecutor | None = None
+        self._batch = self._make_batch()
+        self._factories = None if self.family is not None else factories
+
+    def copies(self, n_envs_per_client: int, role: int) -> FederatedVecEnv:
+        """The same clients with another number of copies and other random streams, for example for evaluation.
+
+        :raises ValueError: for an unpickled environment of the user's own functions, which do not pickle
+        """
+        source = self.family if self.family is not None else self._factories
+        if source is None:
+            raise ValueError("the functions that made these environments are gone; make a FederatedVecEnv from them again")
+        return FederatedVecEnv(source, n_envs_per_client, self.client_ids, self.num_threads, role)
+
+    def _make_batch(self) -> Batch[Any]:
+        if self.family is None:
+            return FactoryBatch(self.envs)
+        return type(self.envs[0]).batch_class(self.envs)  # type: ignore[attr-defined]
+
+    @property
+    def active(self) -> np.ndarray:
+        """``(num_envs,)`` bool, writable: inactive environments are not stepped (same observation, reward 0, not done)."""
+        return self._active
+
+    @active.setter
+    def active(self, mask: np.ndarray) -> None:
+        self._active[:] = mask
+
+    def seed(self, seed: int | None = None) -> Sequence[int]:
+        """Seed the next reset: copy ``c`` of client ``k`` gets the stream ``(role, k, c)`` of ``seed``, whoever else is here.
+
+        :param seed: the federation's seed; drawn at random if ``None``
+        :return: the environments' seeds
+        """
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        seeds = [integer_seed(seed, self.role, k, c) for k in self.client_ids for c in range(self.n_envs_per_client)]
+        self._seeds = list(seeds)
+        return seeds
+
+    def reset(self) -> np.ndarray:
+        for row in range(self.num_envs):
+            self._reset_row(row, self._seeds[row], self._options[row])
+        self._reset_seeds()
+        self._reset_options()
+        return self._batch.observations.copy()
+
+    def _reset_row(self, row: int, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        observation, self.reset_infos[row] = self.envs[row].reset(seed=seed, options=options or None)
+        self._batch.observations[row] = observation
+        self._lengths[row] = 0
+        self._returns[row] = 0.0
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        if self._actions is None:
+            raise ValueError("step_wait() without step_async(actions) before it")
+        batch, actions, active = self._batch, self._actions, self._active
+        self._actions = None
+        if self.family is not None:
+            actions = np.asarray(actions, dtype=np.float32)
+            if actions.shape != (self.num_envs, *self.action_space.shape):  # type: ignore[misc]
+                raise ValueError(f"expected actions of shape {(self.num_envs, *self.action_space.shape)}, got {actions.shape}")  # type: ignore[misc]
+        all_active = bool(active.all())
+        rows = range(self.num_envs) if all_active else np.flatnonzero(active).tolist()
+        batch.step(actions, rows, self._run if self.num_threads > 1 else run_here)
+
+        rewards, terminated = batch.rewards, batch.terminated
+        self._lengths += active
+        truncated = batch.truncated | (self._lengths >= self._max_steps)
+        infos = batch.infos()
+        dones = terminated | truncated
+        if not all_active:
+            rewards = np.where(active, rewards, 0.0)
+            dones &= active
+            infos = [info if alive else {} for info, alive in zip(infos, active, strict=True)]
+        if not np.isfinite(rewards).all():
+            row = int(np.flatnonzero(~np.isfinite(rewards))[0])
+            client, action = self.client_ids[row // self.n_envs_per_client], actions[row]
+            raise ValueError(
+                f"client {client}: the reward is {rewards[row]} after the action {action}; check the policy for NaN"
+            )
+        self._returns += rewards
+        if dones.any():
+            for row in np.flatnonzero(dones).tolist():
+                self._finish(row, infos[row], bool(truncated[row]) and not bool(terminated[row]))
+        return batch.observations.copy(), rewards.astype(np.float32), dones, infos
+
+    def _finish(self, row: int, info: dict[str, Any], truncated: bool) -> None:
+        info["terminal_observation"] = self._batch.observations[row].copy()
+        info["TimeLimit.truncated"] = truncated
+        seconds = round(time.time() - self._start_time, 6)
+        info.setdefault("episode", {"r": float(self._returns[row]), "l": int(self._lengths[row]), "t": seconds})
+        self._reset_row(row)
+
+    def _run(self, work: Callable[[Iterator[int]], None], rows: Sequence[int]) -> None:
+        """Let the threads share one iterator, so that none waits while another still has several environments to step."""
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self.num_threads - 1, thread_name_prefix="fed_envs")
+        shared = iter(rows)
+        others = [self._pool.submit(work, shared) for _ in range(min(self.num_threads, len(rows)) - 1)]
+        work(shared)
+        for other in others:
+            other.result()
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+        for env in self.envs:
+            env.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = self.__dict__.copy()
+        state["_pool"] = state["_factories"] = None
+        state["_batch"] = self._batch.observations.copy()
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        observations = state["_batch"]
+        self._batch = self._make_batch()
+        self._batch.observations[:] = observations
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        return [env.get_wrapper_attr(attr_name) for env in self._targets(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        for env in self._targets(indices):
+            setattr(env, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        return [env.get_wrapper_attr(method_name)(*method_args, **method_kwargs) for env in self._targets(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
+        # What Monitor records is recorded here, so nobody needs to wrap again for it.
+        return [wrapper_class is Monitor or is_wrapped(env, wrapper_class) for env in self._targets(indices)]
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        return [env.render() for env in self.envs]  # type: ignore[misc]
+
+    def _targets(self, indices: VecEnvIndices) -> list[gymnasium.Env]:
+        return [self.envs[index] for index in self._get_indices(indices)]
+
+
+def _checked_clients(clients: Sequence[int] | None, n_clients: int, name: str) -> list[int]:
+    ids = list(range(n_clients)) if clients is None else [int(client) for client in clients]
+    unknown = [client for client in ids if not 0 <= client < n_clients]
+    if unknown:
+        raise ValueError(f"{name} has clients 0 to {n_clients - 1}, not {', '.join(map(str, unknown))}")
+    if not ids or len(set(ids)) != len(ids):
+        raise ValueError(f"clients must name at least one client, each once; got {ids}")
+    return ids
+
+
+def _check_spaces(envs: Sequence[gymnasium.Env]) -> None:
+    first = envs[0]
+    if not isinstance(first.observation_space, spaces.Box):
+        raise ValueError(
+            f"observations must be a Box, got {first.observation_space}; "
+            "flatten others with gymnasium.wrappers.FlattenObservation"
+        )
+    for number, env in enumerate(envs):
+        for kind in ("observation_space", "action_space"):
+            if getattr(env, kind) != getattr(first, kind):
+                raise ValueError(
+                    f"all clients must share their spaces: environment {number} has {kind} {getattr(env, kind)}, "
+                    f"environment 0 has {getattr(first, kind)}"
+                )

@@ -1,0 +1,361 @@
+"""FedGuide: clients learn by PPO, guided by a mixture of behaviour priors that the server routes by optimal transport."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal, Unpack
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_fedguide.algorithms.fedavg import policy_upload
+from sb3_fedguide.common import gaussian
+from sb3_fedguide.common.buffers import FederatedSamples, generalized_advantage
+from sb3_fedguide.common.federated_ppo import FederatedPPO, FederatedPPOArguments
+from sb3_fedguide.common.federation import FederationLike, PolicyLike
+from sb3_fedguide.common.policies import ACTOR_PREFIXES
+from sb3_fedguide.common.seeding import Role, seed_sequence
+from sb3_fedguide.common.value_blend import explained_variances, optimal_blend
+from sb3_fedguide.offline.dice import DiceValue, calibrate
+from sb3_fedguide.offline.pretraining import Pretraining
+from sb3_fedguide.priors.adaptation import HeadAdaptation
+from sb3_fedguide.priors.base import Prior, score_cost
+from sb3_fedguide.priors.importance import importance_weights
+from sb3_fedguide.priors.mixture import mixture_log_prob, mixture_sample
+from sb3_fedguide.server.averaging import Averaging
+from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW, OTMoE
+from sb3_fedguide.server.strategy import Composite, Payload, Strategy
+
+#: Raw actions further outside the action box than this get no importance weight: no behaviour data can lie there.
+ACTION_MARGIN = 0.1
+
+
+class FedGuide(FederatedPPO):
+    """Federated policy optimisation guided by distribution-space priors and an offline value baseline.
+
+    Every client regularises PPO towards its personal prior, a mixture of diffusion priors (paper, Eq. personalized-prior),
+    and computes advantages from a blend of its critic and a frozen DICE value (Eq. Vblend). Only the linear head of the
+    client's prior and its row of transport costs leave it. Round by round the loss is
+
+    ``L = PPO + vf_coef * MSE(V) + lambda_trust * KL(pi_old || pi) + lambda_prior(h) * R_prior``.
+
+    Paper: FedGuide (see ``docs/fedguide.md`` for where this implementation decides otherwise)
+
+    :param lambda_trust: lambda_1, weight of the exact Gaussian trust-region term
+    :param lambda_prior: lambda_2, weight of the prior term in the first round
+    :param prior_horizon: H_lambda2, rounds over which ``lambda_prior`` falls linearly to zero
+    :param prior_loss: ``"snis"``, self-normalised importance weights on the rollout's actions (the paper's estimator), or
+        ``"sample"``, actions drawn from the prior once per round: the same target without weights
+    :param prior_states: states per client and round at which ``"snis"`` evaluates densities; ``None`` for all
+    :param density_steps: Runge-Kutta steps of a density evaluation
+    :param sampling_steps: denoising steps of a sample
+    :param beta: weight of the online critic in the blended baseline: a number, a schedule of the remaining progress, or
+        ``"auto"``, the variance-optimal weight of the paper's Lemma 2 estimated from the rollout
+    :param critic_target: the critic learns the return of its ``"online"`` GAE or of the ``"blend"``
+    :param calibrate: fit the DICE value to the first rollout's returns, ``G ~ a V + b``
+    :param n_experts: M, experts at the server; as many as clients by default
+    :param eta: entropic regularisation of the transport plan
+    :param cost: transport cost, ``"score"`` or ``"param"`` (see :class:`~sb3_fedguide.server.ot_moe.OTMoE`)
+    :param cost_scaling: ``"max"`` or ``"median"``
+    :param adapt: ``"none"`` keeps the pretrained head; ``"advantage"`` refits it after each round on the offline data and
+        recent rollouts weighted by ``exp(A / adapt_temperature)``, so that what a client learns online reaches the others
+    :param adapt_temperature: temperature of these weights, in standard deviations of the advantage
+    :param adapt_weight: share of the recent rollouts in the refit, in [0, 1]
+
+    All other parameters are those of :class:`FederatedPPO`.
+    """
+
+    uses_dice: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        policy: PolicyLike,
+        env: FederationLike | None,
+        lambda_trust: float = 0.05,
+        lambda_prior: float = 0.5,
+        prior_horizon: int = 50,
+        prior_loss: Literal["snis", "sample"] = "snis",
+        prior_states: int | None = 512,
+        density_steps: int = 4,
+        sampling_steps: int = 10,
+        beta: float | Schedule | Literal["auto"] = 0.5,
+        critic_target: Literal["online", "blend"] = "online",
+        calibrate: bool = False,
+        n_experts: int | None = None,
+        eta: float = 0.05,
+        cost: Literal["score", "param"] = "score",
+        cost_scaling: Literal["max", "median"] = "max",
+        adapt: Literal["none", "advantage"] = "none",
+        adapt_temperature: float = 1.0,
+        adapt_weight: float = 0.5,
+        **ppo: Unpack[FederatedPPOArguments],
+    ) -> None:
+        _check_choice("prior_loss", prior_loss, ("snis", "sample"))
+        _check_choice("critic_target", critic_target, ("online", "blend"))
+        _check_choice("adapt", adapt, ("none", "advantage"))
+        if isinstance(beta, str):
+            _check_choice("beta", beta, ("auto",))
+        elif not callable(beta) and not 0.0 <= beta <= 1.0:
+            raise ValueError(f"beta={beta} must lie in [0, 1]: it is the online critic's weight in the baseline")
+        if min(lambda_trust, lambda_prior) < 0 or prior_horizon < 1:
+            raise ValueError("lambda_trust and lambda_prior must not be negative, and prior_horizon must be at least 1")
+        self.lambda_trust = lambda_trust
+        self.lambda_prior = lambda_prior
+        self.prior_horizon = prior_horizon
+        self.prior_loss = prior_loss
+        self.prior_states = prior_states
+        self.density_steps = density_steps
+        self.sampling_steps = sampling_steps
+        self.beta = beta
+        self.critic_target = critic_target
+        self.calibrate = calibrate
+        self.n_experts = n_experts
+        self.eta = eta
+        self.cost = cost
+        self.cost_scaling = cost_scaling
+        self.adapt = adapt
+        self.adapt_temperature = adapt_temperature
+        self.adapt_weight = adapt_weight
+        self.prior: Prior | None = None
+        self.dice: DiceValue | None = None
+        self.dice_scale: np.ndarray | None = None  # (n_clients, 2): a and b of the calibration
+        self.adaptation: HeadAdaptation | None = None
+        super().__init__(policy, env, **ppo)
+
+    # -- server and what crosses to it -------------------------------------------------------------------------------
+
+    def _make_strategy(self) -> Strategy:
+        assert self.seed is not None
+        n_experts = self.n_experts or self.n_clients
+        return OTMoE(n_experts, self.eta, self.cost, self.cost_scaling, seed_sequence(self.seed, Role.SERVER))
+
+    def upload(self, index: int) -> Payload:
+        payload: Payload = {HEAD: self.heads[index]}
+        if self.cost == "score" and self.experts is not None:
+            row = score_cost(self.heads[index], self.experts[index], self.score_moments[index])
+            payload[COST_ROW] = row.astype(np.float32)
+        return payload
+
+    def receive(self, index: int, broadcast: Payload) -> None:
+        if self.experts is None:
+            self.experts = np.zeros((self.n_clients, *broadcast[EXPERTS].shape), dtype=np.float32)
+            self.mixture_rows = np.full((self.n_clients, len(broadcast[EXPERTS])), np.nan, dtype=np.float32)
+        self.experts[index] = broadcast[EXPERTS]
+        if MIXTURE_ROW in broadcast:
+            self.mixture_rows[index] = broadcast[MIXTURE_ROW]
+
+    # -- offline stage -----------------------------------------------------------------------------------------------
+
+    def _pretrain(self, stage: Pretraining) -> None:
+        fitted = stage.prior()
+        self.prior = fitted.prior
+        self.heads = fitted.heads  # psi_i, (n_clients, action_dim, p + 1)
+        self.score_moments = fitted.moments  # S_i of the score cost; stay with their client
+        self.experts: np.ndarray | None = None  # what each client last received, (n_clients, n_experts, ...)
+        if self.adapt == "advantage":
+            self.adaptation = HeadAdaptation(fitted.statistics, self.adapt_weight, self.adapt_temperature)
+        if self.uses_dice:
+            self.dice = stage.dice()
+
+    # -- advantages (paper, section "DICE value baseline") -----------------------------------------------------------
+
+    def _compute_advantages(
+        self, last_values: np.ndarray, truncation_values: np.ndarray, last_raw_obs: np.ndarray, dones: np.ndarray
+    ) -> None:
+        super()._compute_advantages(last_values, truncation_values, last_raw_obs, dones)
+        if self.dice is None:
+            return
+        buffer = self.rollout_buffer
+        rewards = buffer.bootstrapped_rewards(self.gamma, truncation_values)
+        monte_carlo = buffer.values + generalized_advantage(
+            rewards, buffer.values, last_values, buffer.episode_starts, dones, self.gamma, 1.0
+        )
+        returns = buffer.rows(monte_carlo)
+        raw = buffer.rows(buffer.raw_observations)
+        if self.calibrate and self.dice_scale is None:
+            self.dice_scale = np.array(
+                [
+                    calibrate(self.dice.client_values(i, raw[i]) / deviation, returns[i])
+                    for i, deviation in enumerate(self.normalizer.reward_deviation)
+                ]
+            )
+        dice = np.stack([self._dice_values(i, raw[i]) for i in range(self.n_clients)])
+        online = buffer.rows(buffer.values)
+        beta = self._blend_weights(returns, online, dice)
+
+        blended = buffer.unrows(beta[:, None] * online + (1 - beta)[:, None] * dice)  # Eq. Vblend
+        dice_last = np.stack([self._dice_values(i, last_raw_obs[i]) for i in range(self.n_clients)])
+        blended_last = beta[:, None] * last_values + (1 - beta)[:, None] * dice_last
+        blended_truncations = np.array(
+            [
+                beta[client] * value + (1 - beta[client]) * self._dice_values(client, final[None])[0]
+                for (_, client, _, final, _), value in zip(buffer.truncations, truncation_values, strict=True)
+            ],
+            dtype=np.float32,
+        )
+        buffer.advantages[:] = generalized_advantage(  # Eq. GAE
+            buffer.bootstrapped_rewards(self.gamma, blended_truncations),
+            blended.astype(np.float32),
+            blended_last.astype(np.float32),
+            buffer.episode_starts,
+            dones,
+            self.gamma,
+            self.gae_lambda,
+        )
+        if self.critic_target == "blend":
+            buffer.returns[:] = buffer.advantages + blended
+        self.logger.record("dice/beta", float(beta.mean()))
+        for name, values in (("online", online), ("dice", dice), ("blend", buffer.rows(blended))):
+            self.logger.record(f"dice/explained_variance_{name}", float(explained_variances(values, returns).mean()))
+
+    def _dice_values(self, index: int, raw_obs: np.ndarray) -> np.ndarray:
+        """V_phi of one client at raw observations ``(batch, obs_dim)``, in the scale of its rewards, ``(batch,)``."""
+        assert self.dice is not None
+        values = self.dice.client_values(index, raw_obs) / self.normalizer.reward_deviation[index]
+        if self.dice_scale is not None:
+            values = self.dice_scale[index, 0] * values + self.dice_scale[index, 1]
+        return values.astype(np.float32)
+
+    def _blend_weights(self, returns: np.ndarray, online: np.ndarray, dice: np.ndarray) -> np.ndarray:
+        """beta of each client, ``(n_clients,)``; arguments ``(n_clients, n_rows)``."""
+        if self.beta == "auto":
+            return optimal_blend(returns, online, dice).astype(np.float32)
+        beta = self.beta(self._current_progress_remaining) if callable(self.beta) else self.beta
+        return np.full(self.n_clients, beta, dtype=np.float32)
+
+    # -- losses (paper, Eq. client-objective) ------------------------------------------------------------------------
+
+    def prior_weight(self, round: int) -> float:
+        """lambda_2(h), counted from h = 0."""
+        return self.lambda_prior * max(0.0, 1.0 - round / self.prior_horizon)
+
+    @th.no_grad()
+    def _prepare_training(self) -> None:
+        buffer = self.rollout_buffer
+        self._prior_weight = self.prior_weight(self.round)
+        if self.lambda_trust > 0:
+            observations = th.as_tensor(buffer.rows(buffer.observations), device=self.device)
+            buffer.extras["old_mean"] = self.policy.actor_mean(observations)
+            self._old_log_std = self.policy.log_std.detach().clone()
+        self.logger.record("prior/lambda_prior", self._prior_weight)
+        if self._prior_weight > 0:
+            if self.prior_loss == "snis":
+                self._prepare_importance_weights()
+            else:
+                self._prepare_prior_actions()
+
+    def _prepare_importance_weights(self) -> None:
+        """Self-normalised weights of the rollout's actions under the mixture, with mean one over the whole rollout."""
+        assert self.prior is not None and self.experts is not None
+        buffer = self.rollout_buffer
+        raw, actions = buffer.rows(buffer.raw_observations), buffer.rows(buffer.actions)
+        policy_log_probs = buffer.rows(buffer.log_probs)
+        bound = np.maximum(np.abs(self.action_space.low), np.abs(self.action_space.high)) + ACTION_MARGIN  # type: ignore
+        weights = np.zeros((self.n_clients, buffer.n_rows), dtype=np.float32)
+        n_states = min(self.prior_states or buffer.n_rows, buffer.n_rows)
+        sizes = []
+        for i, rng in enumerate(self.streams(Role.PRIOR)):
+            chosen = np.sort(rng.choice(buffer.n_rows, n_states, replace=False))
+            log_prior = mixture_log_prob(
+                self.prior,
+                self.experts[i],
+                self.mixture_rows[i],
+                th.as_tensor(raw[i, chosen]),
+                th.as_tensor(actions[i, chosen]),
+                n_steps=self.density_steps,
+            ).numpy()
+            supported = (np.abs(actions[i, chosen]) <= bound).all(axis=1)
+            drawn, size = importance_weights(log_prior - policy_log_probs[i, chosen], supported)
+            weights[i, chosen] = drawn * (buffer.n_rows / n_states)
+            sizes.append(size / n_states)
+        buffer.extras["prior_weights"] = th.as_tensor(weights, device=self.device)
+        self.logger.record("prior/effective_sample_share", float(np.mean(sizes)))
+        self.logger.record("prior/effective_sample_share_min", float(np.min(sizes)))
+
+    def _prepare_prior_actions(self) -> None:
+        """One action per visited state from the mixture."""
+        assert self.prior is not None and self.experts is not None
+        raw = self.rollout_buffer.rows(self.rollout_buffer.raw_observations)
+        drawn = [
+            mixture_sample(
+                self.prior,
+                self.experts[i],
+                self.mixture_rows[i],
+                th.as_tensor(raw[i]),
+                rng,
+                n_steps=self.sampling_steps,
+            )
+            for i, rng in enumerate(self.streams(Role.PRIOR))
+        ]
+        low, high = th.as_tensor(self.action_space.low), th.as_tensor(self.action_space.high)  # type: ignore[attr-defined]
+        self.rollout_buffer.extras["prior_actions"] = th.clamp(th.stack(drawn), low, high).to(self.device)
+
+    def _extra_losses(self, data: FederatedSamples, mean: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
+        losses = {}
+        if self.lambda_trust > 0:
+            kl = gaussian.kl_divergence(data.extras["old_mean"], self._old_log_std, mean, self.policy.log_std)
+            losses["trust_loss"] = self.lambda_trust * kl.mean(dim=1)
+        if "prior_weights" in data.extras:
+            cross_entropy = -(data.extras["prior_weights"] * log_prob).mean(dim=1)
+            losses["prior_loss"] = self._prior_weight * cross_entropy
+        elif "prior_actions" in data.extras:
+            prior_log_prob = gaussian.log_prob(mean, self.policy.log_std, data.extras["prior_actions"])
+            losses["prior_loss"] = -self._prior_weight * prior_log_prob.mean(dim=1)
+        return losses
+
+    # -- adaptation of the head --------------------------------------------------------------------------------------
+
+    def _finish_training(self) -> None:
+        if self.adaptation is None:
+            return
+        assert self.prior is not None
+        buffer = self.rollout_buffer
+        raw, advantages = buffer.rows(buffer.raw_observations), buffer.rows(buffer.advantages)
+        executed = np.clip(buffer.rows(buffer.actions), self.action_space.low, self.action_space.high)  # type: ignore
+        moved = np.zeros(self.n_clients)
+        for i, rng in enumerate(self.streams(Role.HEAD)):
+            head = self.adaptation.refit(self.prior, i, raw[i], executed[i], advantages[i], rng)
+            moved[i] = np.linalg.norm(head - self.heads[i]) / np.linalg.norm(self.heads[i])
+            self.heads[i] = head
+        self.logger.record("prior/head_change", float(moved.mean()))
+
+
+class FedGuideP(FedGuide):
+    """FedGuide-P: the prior without the DICE value, ``beta = 1``. Parameters are those of :class:`FedGuide`."""
+
+    uses_dice: ClassVar[bool] = False
+
+
+class FedGuideA(FedGuide):
+    """FedGuide-A: FedGuide whose actors (with ``log_std``) are averaged every few rounds; critics stay local.
+
+    :param average_every: average the actors after rounds ``average_every``, ``2 * average_every``, ...
+
+    All other parameters are those of :class:`FedGuide`.
+    """
+
+    def __init__(
+        self, policy: PolicyLike, env: FederationLike | None, average_every: int = 5, **fedguide: object
+    ) -> None:
+        if average_every < 1:
+            raise ValueError(f"average_every={average_every} must be at least 1 round")
+        self.average_every = average_every
+        super().__init__(policy, env, **fedguide)  # type: ignore[arg-type]
+
+    def _make_strategy(self) -> Strategy:
+        return Composite([super()._make_strategy(), Averaging(ACTOR_PREFIXES, self.average_every)])
+
+    def upload(self, index: int) -> Payload:
+        payload = super().upload(index)
+        if self.round > 0 and self.round % self.average_every == 0:
+            payload.update(policy_upload(self, index, ACTOR_PREFIXES))
+        return payload
+
+    def receive(self, index: int, broadcast: Payload) -> None:
+        super().receive(index, broadcast)
+        self.policy.load_client(index, {name: array for name, array in broadcast.items() if name.startswith(ACTOR_PREFIXES)})
+
+
+def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name}={value!r} must be one of {', '.join(choices)}")

@@ -1,0 +1,148 @@
+"""Rollout storage that keeps the client axis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+
+class FederatedSamples(NamedTuple):
+    """One minibatch of every client: leading dimensions ``(n_clients, batch)``."""
+
+    observations: th.Tensor
+    actions: th.Tensor
+    old_values: th.Tensor
+    old_log_prob: th.Tensor
+    advantages: th.Tensor
+    returns: th.Tensor
+    extras: dict[str, th.Tensor]
+
+
+def generalized_advantage(
+    rewards: np.ndarray,
+    values: np.ndarray,
+    last_values: np.ndarray,
+    episode_starts: np.ndarray,
+    last_dones: np.ndarray,
+    gamma: float,
+    gae_lambda: float,
+) -> np.ndarray:
+    """GAE (paper, Eq. GAE) with any baseline, in SB3's operations and order.
+
+    Rewards of truncated steps already contain ``gamma * V(final observation)``, as in SB3.
+
+    :param rewards: ``(n_steps, n_envs)``, like ``values`` and ``episode_starts``
+    :param last_values: baseline of the state after the rollout, ``(n_envs,)``; ``last_dones`` alike
+    :return: advantages, ``(n_steps, n_envs)``
+    """
+    advantages = np.zeros_like(rewards)
+    last_gae_lam: np.ndarray | float = 0.0
+    next_non_terminal = 1.0 - last_dones.astype(np.float32)
+    next_values = last_values
+    for step in reversed(range(len(rewards))):
+        delta = rewards[step] + gamma * next_values * next_non_terminal - values[step]
+        last_gae_lam = delta + gamma * gae_lambda * next_non_terminal * last_gae_lam
+        advantages[step] = last_gae_lam
+        next_non_terminal = 1.0 - episode_starts[step]
+        next_values = values[step]
+    return advantages
+
+
+class FederatedRolloutBuffer:
+    """One round's rollout of all clients.
+
+    Arrays are ``(n_steps, n_clients, n_envs_per_client, ...)`` while it is collected. A client's rows are numbered
+    ``env * n_steps + step``, as ``stable_baselines3.RolloutBuffer`` flattens them.
+
+    :param n_steps: steps per environment
+    """
+
+    def __init__(
+        self, n_steps: int, n_clients: int, n_envs_per_client: int, observation_space: spaces.Box, action_space: spaces.Box
+    ) -> None:
+        self.n_steps, self.n_clients, self.n_envs_per_client = n_steps, n_clients, n_envs_per_client
+        shape = (n_steps, n_clients, n_envs_per_client)
+        self.raw_observations = np.zeros((*shape, *observation_space.shape), dtype=np.float32)
+        self.observations = np.zeros_like(self.raw_observations)
+        self.actions = np.zeros((*shape, *action_space.shape), dtype=np.float32)
+        self.rewards = np.zeros(shape, dtype=np.float32)
+        self.episode_starts = np.zeros(shape, dtype=np.float32)
+        self.values = np.zeros(shape, dtype=np.float32)
+        self.log_probs = np.zeros(shape, dtype=np.float32)
+        self.advantages = np.zeros(shape, dtype=np.float32)
+        self.returns = np.zeros(shape, dtype=np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new rollout."""
+        self.pos = 0
+        self.truncations: list[tuple[int, int, int, np.ndarray, np.ndarray]] = []
+        self.extras: dict[str, th.Tensor] = {}
+
+    @property
+    def full(self) -> bool:
+        return self.pos == self.n_steps
+
+    @property
+    def n_rows(self) -> int:
+        """Rows per client."""
+        return self.n_steps * self.n_envs_per_client
+
+    def add(
+        self,
+        raw_obs: np.ndarray,
+        obs: np.ndarray,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        episode_starts: np.ndarray,
+    ) -> None:
+        """Append one step, arrays ``(n_clients, n_envs_per_client, ...)``; values and log-probabilities follow in bulk."""
+        pos = self.pos
+        self.raw_observations[pos] = raw_obs
+        self.observations[pos] = obs
+        self.actions[pos] = actions
+        self.rewards[pos] = rewards
+        self.episode_starts[pos] = episode_starts
+        self.pos += 1
+
+    def add_truncation(self, client: int, env: int, raw_obs: np.ndarray, obs: np.ndarray) -> None:
+        """Remember the final observation of an episode that the time limit ended at the step added last."""
+        self.truncations.append((self.pos - 1, client, env, raw_obs, obs))
+
+    def rows(self, array: np.ndarray) -> np.ndarray:
+        """``(n_steps, n_clients, n_envs_per_client, ...)`` to ``(n_clients, n_rows, ...)``."""
+        return np.moveaxis(array, 0, 2).reshape(self.n_clients, self.n_rows, *array.shape[3:])
+
+    def unrows(self, array: np.ndarray) -> np.ndarray:
+        """The inverse of :meth:`rows`."""
+        split = array.reshape(self.n_clients, self.n_envs_per_client, self.n_steps, *array.shape[2:])
+        return np.moveaxis(split, 2, 0)
+
+    def bootstrapped_rewards(self, gamma: float, truncation_values: np.ndarray) -> np.ndarray:
+        """Rewards plus ``gamma * V`` of the final observation where the time limit ended an episode.
+
+        :param truncation_values: the baseline at the final observations, in the order they were added
+        """
+        rewards = self.rewards.copy()
+        for (step, client, env, _, _), value in zip(self.truncations, truncation_values, strict=True):
+            rewards[step, client, env] += gamma * value
+        return rewards
+
+    def get(
+        self, batch_size: int, rngs: list[np.random.Generator], device: th.device | str = "cpu"
+    ) -> Iterator[FederatedSamples]:
+        """One epoch of minibatches; every client's order comes from its own generator."""
+        order = th.as_tensor(np.stack([rng.permutation(self.n_rows) for rng in rngs]), device=device)
+        client = th.arange(self.n_clients, device=device).unsqueeze(1)
+        arrays = (self.observations, self.actions, self.values, self.log_probs, self.advantages, self.returns)
+        tensors = [th.as_tensor(self.rows(array), device=device)[client, order] for array in arrays]
+        extras = {name: tensor[client, order] for name, tensor in self.extras.items()}
+        for start in range(0, self.n_rows, batch_size):
+            part = slice(start, start + batch_size)
+            yield FederatedSamples(
+                *(tensor[:, part] for tensor in tensors), extras={name: tensor[:, part] for name, tensor in extras.items()}
+            )

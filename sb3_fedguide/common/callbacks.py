@@ -1,0 +1,115 @@
+"""Callbacks that know of communication rounds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from sb3_fedguide.common.federated_ppo import FederatedPPO
+
+
+class RoundCallback(BaseCallback):
+    """A callback with two more events: after local training, and after the exchange that ends a round.
+
+    Between the two, a method that shares its policy replaces the clients' own parameters: what a client would deploy is
+    seen in :meth:`_on_training_step_end`, what the server broadcast in :meth:`_on_round_end`.
+    """
+
+    model: FederatedPPO
+
+    def _on_step(self) -> bool:
+        return True
+
+    def on_local_training_end(self) -> None:
+        self._on_local_training_end()
+
+    def on_round_end(self) -> None:
+        self._on_round_end()
+
+    def _on_local_training_end(self) -> None:
+        """After ``train()``, before the exchange."""
+
+    def _on_round_end(self) -> None:
+        """After the exchange, before the round's log is written."""
+
+
+def round_callbacks(callback: BaseCallback | None) -> Iterator[RoundCallback]:
+    """The round callbacks in a tree of SB3 callbacks, in order."""
+    if isinstance(callback, RoundCallback):
+        yield callback
+    elif isinstance(callback, CallbackList):
+        for child in callback.callbacks:
+            yield from round_callbacks(child)
+    elif isinstance(callback, EventCallback):
+        yield from round_callbacks(callback.callback)
+
+
+class ExchangeCallback(RoundCallback):
+    """Plays the server in process: carries uploads to the model's ``strategy`` and broadcasts back, and counts bytes.
+
+    A deployment over a network replaces this callback by its transport; clients and strategy stay the same.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bytes_up = 0
+        self.bytes_down = 0
+
+    def _on_training_start(self) -> None:
+        strategy = self.model.strategy
+        while strategy is not None and strategy.needs_setup:
+            self._exchange()
+
+    def _on_round_end(self) -> None:
+        if self.model.strategy is not None:
+            self._exchange()
+
+    def _exchange(self) -> None:
+        model, strategy = self.model, self.model.strategy
+        assert strategy is not None
+        started = time.perf_counter()
+        uploads = {client: model.upload(index) for index, client in enumerate(model.client_ids)}
+        broadcasts = strategy.aggregate(model.round, uploads)
+        for index, client in enumerate(model.client_ids):
+            model.receive(index, broadcasts[client])
+        up, down = payload_bytes(uploads), payload_bytes(broadcasts)
+        self.bytes_up += up
+        self.bytes_down += down
+        for key, value in strategy.metrics.items():
+            self.logger.record(f"federated/{key}", value)
+        self.logger.record("federated/bytes_up", up)
+        self.logger.record("federated/bytes_down", down)
+        self.logger.record("federated/bytes_total", self.bytes_up + self.bytes_down)
+        self.logger.record("time/exchange", time.perf_counter() - started)
+
+
+def payload_bytes(payloads: dict[int, dict[str, np.ndarray]]) -> int:
+    """Size of all arrays of all clients' payloads, in bytes."""
+    return sum(array.nbytes for payload in payloads.values() for array in payload.values())
+
+
+class RoundProgressCallback(RoundCallback):
+    """A progress bar over rounds with the current client-average return of finished training episodes."""
+
+    def __init__(self, total_timesteps: int) -> None:
+        super().__init__()
+        self.total_timesteps = total_timesteps
+        self.bar: Any = None
+
+    def _on_training_start(self) -> None:
+        per_round = self.model.rollout_size * self.model.n_clients
+        remaining = max(0, self.total_timesteps - self.model.num_timesteps)
+        self.bar = tqdm(total=-(-remaining // per_round), desc=type(self.model).__name__, unit="round", dynamic_ncols=True)
+
+    def _on_round_end(self) -> None:
+        self.bar.set_postfix({"return": f"{self.model.mean_episode_return():.1f}"}, refresh=False)
+        self.bar.update()
+
+    def _on_training_end(self) -> None:
+        self.bar.close()

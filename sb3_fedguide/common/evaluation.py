@@ -1,0 +1,153 @@
+"""Evaluation of every client's policy in its own environment, all episodes of all clients batched."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fed_envs import FederatedVecEnv
+from sb3_fedguide.common.callbacks import RoundCallback
+from sb3_fedguide.common.seeding import Role
+
+if TYPE_CHECKING:
+    from sb3_fedguide.common.federation import Federation
+
+#: The seed of evaluation episodes: the same episodes for every method, seed and round.
+EVALUATION_SEED = 20_000
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Episodes of every client.
+
+    :param returns: undiscounted raw returns, ``(n_clients, n_episodes)``
+    :param lengths: steps, ``(n_clients, n_episodes)``
+    """
+
+    returns: np.ndarray
+    lengths: np.ndarray
+
+    @property
+    def client_returns(self) -> np.ndarray:
+        """Mean return of each client, ``(n_clients,)``."""
+        return self.returns.mean(axis=1)
+
+    @property
+    def average(self) -> float:
+        """The client-average return: the measure F where the round is the last."""
+        return float(self.client_returns.mean())
+
+    @property
+    def worst_client(self) -> float:
+        return float(self.client_returns.min())
+
+
+def evaluation_env(federation: Federation, n_episodes: int) -> FederatedVecEnv:
+    """Environments for ``n_episodes`` parallel episodes of each of the federation's clients."""
+    env = federation.get_env()
+    assert isinstance(env, FederatedVecEnv)
+    return env.copies(n_episodes, role=Role.EVAL_ENV)
+
+
+def evaluate_federation(
+    predict: Callable[[np.ndarray], np.ndarray], env: FederatedVecEnv, seed: int = EVALUATION_SEED
+) -> Evaluation:
+    """Run one seeded episode in every copy of every client's environment.
+
+    :param predict: actions for observations ``(num_envs, obs_dim)``, client-major
+    :param env: one copy per client and episode
+    :param seed: of the episodes
+    """
+    env.seed(seed)
+    env.active[:] = True
+    obs = env.reset()
+    returns, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)
+    while env.active.any():
+        obs, rewards, dones, infos = env.step(predict(obs))
+        for index in np.flatnonzero(dones):
+            returns[index], lengths[index] = infos[index]["episode"]["r"], infos[index]["episode"]["l"]
+        env.active[dones] = False
+    shape = (env.n_clients, env.n_envs_per_client)
+    return Evaluation(returns.reshape(shape), lengths.reshape(shape))
+
+
+class FederatedEvalCallback(RoundCallback):
+    """Evaluates the deployed policies every ``eval_freq`` rounds and in each of the last twenty, and writes a CSV.
+
+    The deployed policy is a client's own after local training. Methods that share a policy report the broadcast one as
+    well, every ``eval_freq`` rounds and after the last.
+
+    :param n_rounds: rounds of the whole run
+    :param eval_freq: rounds between evaluations
+    :param n_episodes: episodes per client
+    :param csv_path: file to write, one row per round, client and policy; ``None`` for none
+    :param deterministic: evaluate the mean action
+    """
+
+    LAST_ROUNDS = 20
+
+    def __init__(
+        self,
+        n_rounds: int,
+        eval_freq: int = 5,
+        n_episodes: int = 10,
+        csv_path: str | Path | None = None,
+        deterministic: bool = True,
+    ) -> None:
+        super().__init__()
+        if eval_freq < 1 or n_episodes < 1:
+            raise ValueError(f"eval_freq={eval_freq} and n_episodes={n_episodes} must be at least 1")
+        self.n_rounds, self.eval_freq, self.n_episodes, self.deterministic = n_rounds, eval_freq, n_episodes, deterministic
+        self.csv_path = None if csv_path is None else Path(csv_path)
+        #: the last evaluation of the deployed and of the broadcast policy
+        self.last: dict[str, Evaluation] = {}
+
+    def _on_training_start(self) -> None:
+        self.env = evaluation_env(self.model, self.n_episodes)
+        if self.csv_path is not None and not self.csv_path.exists():
+            header = ("round", "timesteps", "policy", "client", "mean_return", "std_return", "mean_length")
+            with self.csv_path.open("w", newline="") as file:
+                csv.writer(file).writerow(header)
+
+    def _on_local_training_end(self) -> None:
+        round = self.model.round + 1
+        if round % self.eval_freq == 0 or round > self.n_rounds - self.LAST_ROUNDS:
+            evaluation = self._evaluate("deployed", round)
+            self.logger.record("eval/mean_reward", evaluation.average)
+            self.logger.record("eval/worst_client", evaluation.worst_client)
+            self.logger.record("eval/mean_ep_length", float(evaluation.lengths.mean()))
+            for client, value in zip(self.model.client_ids, evaluation.client_returns, strict=True):
+                self.model.record_client(client, "eval_mean_reward", float(value))
+
+    def _on_round_end(self) -> None:
+        round = self.model.round
+        if self.model.shares_policy and (round % self.eval_freq == 0 or round == self.n_rounds):
+            self.logger.record("eval/broadcast_mean_reward", self._evaluate("broadcast", round).average)
+
+    def _on_training_end(self) -> None:
+        self.env.close()
+
+    def _evaluate(self, policy: str, round: int) -> Evaluation:
+        evaluation = evaluate_federation(
+            lambda obs: self.model.predict(obs, deterministic=self.deterministic)[0], self.env
+        )
+        self.last[policy] = evaluation
+        if self.csv_path is not None:
+            with self.csv_path.open("a", newline="") as file:
+                csv.writer(file).writerows(self._rows(policy, round, evaluation))
+                file.flush()
+                os.fsync(file.fileno())
+        return evaluation
+
+    def _rows(self, policy: str, round: int, evaluation: Evaluation) -> list[tuple[Any, ...]]:
+        clients = zip(self.model.client_ids, evaluation.returns, evaluation.lengths, strict=True)
+        return [
+            (round, self.model.num_timesteps, policy, client, f"{r.mean():.6g}", f"{r.std():.6g}", f"{n.mean():.6g}")
+            for client, r, n in clients
+        ]

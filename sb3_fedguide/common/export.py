@@ -1,0 +1,70 @@
+"""One client's policy as an ordinary Stable-Baselines3 model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+if TYPE_CHECKING:
+    from sb3_fedguide.common.federation import Federation
+
+
+class NormalizedObservation(BaseFeaturesExtractor):
+    """Features extractor that applies a client's observation normalisation, so that its model takes raw observations.
+
+    :param mean: ``(obs_dim,)``; ``var`` alike
+    :param clip: bound on the normalised values
+    """
+
+    def __init__(self, observation_space: spaces.Box, mean: list[float], var: list[float], epsilon: float, clip: float) -> None:
+        super().__init__(observation_space, features_dim=observation_space.shape[0])
+        self.clip = clip
+        self.register_buffer("mean", th.tensor(mean, dtype=th.float64))
+        self.register_buffer("deviation", th.sqrt(th.tensor(var, dtype=th.float64) + epsilon))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        scaled = (observations - self.mean) / self.deviation
+        return th.clamp(scaled, -self.clip, self.clip).to(th.float32)
+
+
+def client_model(federation: Federation, index: int) -> PPO:
+    """The client at position ``index`` as a ``stable_baselines3.PPO``; ``set_env`` gives it an environment to train in.
+
+    Policy, critic and normalisation are copied; Adam's moments are not, so that further training starts fresh.
+    """
+    policy = federation.policy
+    policy_kwargs: dict[str, Any] = {
+        "net_arch": policy.net_arch,
+        "activation_fn": policy.activation_fn,
+        "log_std_init": policy.log_std_init,
+    }
+    normalizer = federation.normalizer
+    if normalizer.norm_obs:
+        policy_kwargs["features_extractor_class"] = NormalizedObservation
+        policy_kwargs["features_extractor_kwargs"] = {
+            "mean": normalizer.obs.mean[index].tolist(),
+            "var": normalizer.obs.var[index].tolist(),
+            "epsilon": normalizer.EPSILON,
+            "clip": normalizer.CLIP,
+        }
+    settings = {name: getattr(federation, name) for name in ("n_steps", "batch_size", "gamma", "gae_lambda", "n_epochs")}
+    model = PPO(
+        "MlpPolicy",
+        None,  # type: ignore[arg-type]
+        learning_rate=federation.learning_rate,
+        policy_kwargs=policy_kwargs,
+        seed=federation.seed,
+        device="cpu",
+        _init_setup_model=False,
+        **settings,
+    )
+    model.observation_space, model.action_space = federation.observation_space, federation.action_space
+    model.n_envs = 1
+    model._setup_model()
+    state = policy.client_state_dict(index)
+    model.policy.load_state_dict({**model.policy.state_dict(), **state})
+    return model

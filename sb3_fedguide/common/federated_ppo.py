@@ -1,0 +1,400 @@
+"""Proximal policy optimisation of N clients in lockstep: one SB3 algorithm is a whole federation."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, TypedDict, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule
+
+from fed_envs import FederatedVecEnv
+from sb3_fedguide.common import gaussian
+from sb3_fedguide.common.buffers import FederatedRolloutBuffer, FederatedSamples, generalized_advantage
+from sb3_fedguide.common.callbacks import round_callbacks
+from sb3_fedguide.common.federation import Federation, FederationLike, PolicyLike, as_federated_env
+from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.policies import StackedMlpPolicy
+from sb3_fedguide.common.seeding import Role, integer_seed
+from sb3_fedguide.common.training_log import RoundStatistics, record_training
+from sb3_fedguide.offline.pretraining import PretrainingConfig
+
+SelfFederatedPPO = TypeVar("SelfFederatedPPO", bound="FederatedPPO")
+
+
+class FederatedPPOArguments(TypedDict, total=False):
+    """Keyword arguments of :class:`FederatedPPO` that its subclasses hand on; the constructor states their defaults."""
+
+    learning_rate: float | Schedule
+    rollout_size: int
+    batch_size: int
+    n_epochs: int
+    gamma: float
+    gae_lambda: float
+    clip_range: float | Schedule
+    clip_range_vf: float | Schedule | None
+    normalize_advantage: bool
+    ent_coef: float
+    vf_coef: float
+    max_grad_norm: float
+    n_envs_per_client: int
+    clients: Sequence[int] | None
+    normalize: bool
+    bc_weight: float
+    pretraining: PretrainingConfig | dict[str, Any] | None
+    cache_dir: str | Path | None
+    stats_window_size: int
+    tensorboard_log: str | None
+    policy_kwargs: dict[str, Any] | None
+    verbose: int
+    seed: int | None
+    device: th.device | str
+    _init_setup_model: bool
+
+
+class FederatedPPO(Federation, PPO):
+    """PPO for every client of a family at once; the base class of every on-policy method.
+
+    One rollout and one ``train()`` is one communication round. A method adds to it by a few hooks: a server ``strategy``
+    with ``upload`` and ``receive``, :meth:`_prepare_training`, :meth:`_extra_losses` and :meth:`_transform_gradients`. Without them, N clients learn exactly as N separate SB3 PPO runs.
+
+    Paper: https://arxiv.org/abs/1707.06347 (PPO)
+
+    :param policy: ``"MlpPolicy"``
+    :param env: name of a family (``"HopperHard"``), path of a metadata file, a ``fed_envs.Family``, a
+        ``fed_envs.FederatedVecEnv``, or a list with one environment factory per client
+    :param learning_rate: as in SB3
+    :param rollout_size: environment steps per client and round
+    :param batch_size: minibatch size per client
+    :param n_epochs: passes over the rollout
+    :param gamma: discount factor
+    :param gae_lambda: trace coefficient of GAE
+    :param clip_range: as in SB3, like ``clip_range_vf``, ``normalize_advantage``, ``ent_coef`` and ``vf_coef``
+    :param max_grad_norm: bound on each client's own gradient norm
+    :param n_envs_per_client: environments per client; must divide ``rollout_size``
+    :param clients: ids of the clients that live here; all by default
+    :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client
+    :param bc_weight: alpha of ``theta_0 = (1 - alpha) theta_rand + alpha theta_BC`` for the actor (paper: 0.3)
+    :param pretraining: settings of the offline stage, a ``PretrainingConfig`` or a dict of its fields
+    :param cache_dir: where the offline stage keeps its results; by default the user's cache folder
+    :param stats_window_size: finished episodes per client over which returns are averaged
+    :param tensorboard_log: as in SB3, like ``policy_kwargs``, ``verbose`` and ``device``
+    :param seed: the federation's seed; drawn and stored if ``None``
+    :raises ValueError: for settings that do not fit, with the remedy in the message
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": StackedMlpPolicy}
+    rollout_buffer: FederatedRolloutBuffer  # type: ignore[assignment]
+    policy: StackedMlpPolicy
+
+    def __init__(
+        self,
+        policy: PolicyLike,
+        env: FederationLike | None,
+        learning_rate: float | Schedule = 3e-4,
+        rollout_size: int = 4096,
+        batch_size: int = 64,
+        n_epochs: int = 4,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip_range: float | Schedule = 0.2,
+        clip_range_vf: float | Schedule | None = None,
+        normalize_advantage: bool = True,
+        ent_coef: float = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        n_envs_per_client: int = 1,
+        clients: Sequence[int] | None = None,
+        normalize: bool = False,
+        bc_weight: float = 0.0,
+        pretraining: PretrainingConfig | dict[str, Any] | None = None,
+        cache_dir: str | Path | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "cpu",
+        _init_setup_model: bool = True,
+    ) -> None:
+        env = as_federated_env(env, n_envs_per_client, clients)
+        self._init_federation(env, normalize, bc_weight, pretraining, cache_dir)
+        _check_sizes(rollout_size, batch_size, self.n_envs_per_client)
+        self.rollout_size = rollout_size
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=rollout_size // self.n_envs_per_client,
+            batch_size=batch_size,
+            n_epochs=n_epochs,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            clip_range=clip_range,
+            clip_range_vf=clip_range_vf,
+            normalize_advantage=normalize_advantage,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        if _init_setup_model:
+            self._setup_model()
+
+    # -- set-up ------------------------------------------------------------------------------------------------------
+
+    def _setup_model(self) -> None:
+        assert self.seed is not None
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.rollout_buffer = FederatedRolloutBuffer(
+            self.n_steps, self.n_clients, self.n_envs_per_client, self.observation_space, self.action_space  # type: ignore
+        )
+        kwargs = {**self.policy_kwargs, "n_clients": self.n_clients, "init_seed": integer_seed(self.seed, Role.INIT)}
+        self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs).to(self.device)  # type: ignore
+        self.clip_range: Schedule = FloatSchedule(self.clip_range)
+        self.clip_range_vf: Schedule | None = None if self.clip_range_vf is None else FloatSchedule(self.clip_range_vf)
+        self.normalizer = FederatedNormalizer(
+            self.n_clients,
+            self.n_envs_per_client,
+            self.observation_space.shape[0],  # type: ignore[index]
+            self.gamma,
+            norm_obs=self.normalize,
+            norm_reward=self.normalize,
+        )
+        if self.strategy is None:
+            self.strategy = self._make_strategy()
+
+    # -- what a method defines ---------------------------------------------------------------------------------------
+
+    def _prepare_training(self) -> None:
+        """After the rollout, before the first minibatch: compute what the extra losses need, once per round."""
+
+    def _finish_training(self) -> None:
+        """After the last minibatch."""
+
+    def _extra_losses(self, data: FederatedSamples, mean: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
+        """Further loss terms by name, each ``(n_clients,)`` and already weighted.
+
+        :param mean: the current policies' means, ``(n_clients, batch, action_dim)``
+        :param log_prob: log-density of ``data.actions`` under the current policies, ``(n_clients, batch)``
+        """
+        return {}
+
+    def _transform_gradients(self, data: FederatedSamples) -> None:
+        """Change ``parameter.grad`` in place, before clipping."""
+
+    # -- one round ---------------------------------------------------------------------------------------------------
+
+    def learn(
+        self: SelfFederatedPPO,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfFederatedPPO:
+        """Train for ``total_timesteps`` steps of all clients together, rounded up to whole rounds; otherwise as in SB3."""
+        self.pretrain(progress_bar)
+        # SB3 logs before train() and offers no event after it, so the loop is our own: rollout, train, exchange, log.
+        total_timesteps, callbacks = self._setup_learn(
+            total_timesteps,
+            self._round_callbacks(callback, total_timesteps, progress_bar),
+            reset_num_timesteps,
+            tb_log_name or type(self).__name__,
+        )
+        if reset_num_timesteps:
+            self.round = 0
+        self._begin_learning(environments_were_reset=reset_num_timesteps)
+        rounds = list(round_callbacks(callbacks))
+        callbacks.on_training_start(locals(), globals())
+        while self.num_timesteps < total_timesteps:
+            started = time.perf_counter()
+            if not self.collect_rollouts(self.env, callbacks, self.rollout_buffer, self.n_steps):  # type: ignore[arg-type]
+                break
+            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
+            collected = time.perf_counter()
+            self.train()
+            self.logger.record("time/rollout", collected - started)
+            self.logger.record("time/train", time.perf_counter() - collected)
+            for hook in rounds:
+                hook.on_local_training_end()
+            self.round += 1
+            for hook in rounds:
+                hook.on_round_end()
+            if log_interval is not None and self.round % log_interval == 0:
+                self.dump_logs(self.round)
+        callbacks.on_training_end()
+        return self
+
+    def collect_rollouts(  # type: ignore[override]
+        self, env: FederatedVecEnv, callback: BaseCallback, rollout_buffer: FederatedRolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """One round's experience of every client; values and log-probabilities are computed in bulk at its end."""
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        self.policy.set_training_mode(False)
+        rollout_buffer.reset()
+        callback.on_rollout_start()
+        shape = (self.n_clients, self.n_envs_per_client)
+        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+        noise = self._exploration_noise(n_rollout_steps)
+        raw_obs = self._last_obs.reshape(*shape, -1)  # type: ignore[union-attr]
+        obs = self.normalizer.normalize_obs(raw_obs)
+        starts = self._last_episode_starts.reshape(shape)
+        dones = starts
+        for step in range(n_rollout_steps):
+            with th.no_grad():
+                mean = self.policy.actor_mean(th.as_tensor(obs, device=self.device)).cpu().numpy()
+            actions = mean + noise[step]
+            flat_actions = np.clip(actions, low, high).reshape(env.num_envs, -1)
+            new_raw_obs, raw_rewards, flat_dones, infos = env.step(flat_actions)
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            dones = flat_dones.reshape(shape)
+            next_raw = new_raw_obs.reshape(*shape, -1)  # type: ignore[union-attr]
+            self.normalizer.update_obs(next_raw)
+            rewards = self.normalizer.scale_reward(raw_rewards.reshape(shape), dones)
+            rollout_buffer.add(raw_obs, obs, actions, rewards, starts)
+            for index in np.flatnonzero(flat_dones):
+                self._end_episode(int(index), infos[index])
+            raw_obs, obs, starts = next_raw, self.normalizer.normalize_obs(next_raw), dones
+        self._last_obs, self._last_episode_starts = new_raw_obs, flat_dones
+        self._finish_rollout(raw_obs, obs, dones)
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _exploration_noise(self, n_steps: int) -> np.ndarray:
+        """Every client's Gaussian noise for a whole rollout, from its own stream: ``(n_steps, n_clients, n_envs, dim)``."""
+        per_client = (n_steps, self.n_envs_per_client, self.action_space.shape[0])  # type: ignore[index]
+        draws = [rng.standard_normal(per_client, dtype=np.float32) for rng in self.streams(Role.ACTION)]
+        std = self.policy.log_std.detach().exp().cpu().numpy()
+        return np.stack(draws, axis=1) * std[None, :, None]
+
+    def _end_episode(self, index: int, info: dict[str, Any]) -> None:
+        client, env = divmod(index, self.n_envs_per_client)
+        if "episode" in info:
+            self.episode_infos[client].append(info["episode"])
+        if info.get("TimeLimit.truncated", False):
+            final = np.asarray(info["terminal_observation"])
+            self.rollout_buffer.add_truncation(client, env, final, self.normalizer.normalize_obs(final, client))
+
+    @th.no_grad()
+    def _finish_rollout(self, raw_obs: np.ndarray, obs: np.ndarray, dones: np.ndarray) -> None:
+        """Values, log-probabilities and advantages of the whole rollout."""
+        buffer = self.rollout_buffer
+        rows = th.as_tensor(buffer.rows(buffer.observations), device=self.device)
+        actions = th.as_tensor(buffer.rows(buffer.actions), device=self.device)
+        log_probs = gaussian.log_prob(self.policy.actor_mean(rows), self.policy.log_std, actions)
+        buffer.log_probs[:] = buffer.unrows(log_probs.cpu().numpy())
+        buffer.values[:] = buffer.unrows(self.policy.values(rows).cpu().numpy())
+        last_values = self.policy.values(th.as_tensor(obs, device=self.device)).cpu().numpy()
+        self._compute_advantages(last_values, self._truncation_values(), raw_obs, dones)
+
+    def _truncation_values(self) -> np.ndarray:
+        """The critics' values of final observations of truncated episodes, in the order they happened."""
+        values = np.zeros(len(self.rollout_buffer.truncations), dtype=np.float32)
+        for position, (_, client, _, _, obs) in enumerate(self.rollout_buffer.truncations):
+            batch = np.zeros((self.n_clients, 1, len(obs)), dtype=np.float32)
+            batch[client] = obs
+            values[position] = self.policy.values(th.as_tensor(batch, device=self.device))[client, 0].item()
+        return values
+
+    def _compute_advantages(
+        self, last_values: np.ndarray, truncation_values: np.ndarray, last_raw_obs: np.ndarray, dones: np.ndarray
+    ) -> None:
+        """GAE with the online critic, and its returns as the critic's targets."""
+        buffer = self.rollout_buffer
+        rewards = buffer.bootstrapped_rewards(self.gamma, truncation_values)
+        buffer.advantages[:] = generalized_advantage(
+            rewards, buffer.values, last_values, buffer.episode_starts, dones, self.gamma, self.gae_lambda
+        )
+        buffer.returns[:] = buffer.advantages + buffer.values
+
+    def train(self) -> None:
+        """SB3's PPO update for all clients at once: per-client losses, advantage normalisation and gradient clipping."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        clip_range = self.clip_range(self._current_progress_remaining)
+        clip_range_vf = None if self.clip_range_vf is None else self.clip_range_vf(self._current_progress_remaining)
+        parameters = list(self.policy.parameters())
+        statistics = RoundStatistics()
+        self._prepare_training()
+        for _ in range(self.n_epochs):
+            for data in self.rollout_buffer.get(self.batch_size, self.streams(Role.MINIBATCH), self.device):
+                mean = self.policy.actor_mean(data.observations)
+                values = self.policy.values(data.observations)
+                log_prob = gaussian.log_prob(mean, self.policy.log_std, data.actions)
+                entropy = gaussian.entropy(self.policy.log_std)
+
+                advantages = data.advantages
+                if self.normalize_advantage and advantages.shape[1] > 1:
+                    centred = advantages - advantages.mean(dim=1, keepdim=True)
+                    advantages = centred / (advantages.std(dim=1, keepdim=True) + 1e-8)
+                log_ratio = log_prob - data.old_log_prob
+                ratio = th.exp(log_ratio)
+                clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
+                policy_loss = -th.min(advantages * ratio, advantages * clipped).mean(dim=1)
+                if clip_range_vf is not None:
+                    change = th.clamp(values - data.old_values, -clip_range_vf, clip_range_vf)
+                    values = data.old_values + change
+                value_loss = ((data.returns - values) ** 2).mean(dim=1)
+                loss = policy_loss - self.ent_coef * entropy + self.vf_coef * value_loss
+                extra_losses = self._extra_losses(data, mean, log_prob)
+                for term in extra_losses.values():
+                    loss = loss + term
+
+                self.policy.optimizer.zero_grad()
+                loss.sum().backward()
+                self._transform_gradients(data)
+                grad_norm = clip_grad_norm_per_client(parameters, self.max_grad_norm)
+                self.policy.optimizer.step()
+                with th.no_grad():
+                    statistics.add(
+                        policy_gradient_loss=policy_loss,
+                        value_loss=value_loss,
+                        entropy_loss=-entropy,
+                        approx_kl=(ratio - 1 - log_ratio).mean(dim=1),
+                        clip_fraction=((ratio - 1).abs() > clip_range).float().mean(dim=1),
+                        grad_norm=grad_norm,
+                        loss=loss,
+                        **extra_losses,
+                    )
+            self._n_updates += 1
+        self._finish_training()
+        record_training(self, statistics, {"clip_range": self.clip_range, "clip_range_vf": self.clip_range_vf})
+
+
+def clip_grad_norm_per_client(parameters: Sequence[th.nn.Parameter], max_norm: float) -> th.Tensor:
+    """``clip_grad_norm_`` for each client by itself; returns the norms before clipping, ``(n_clients,)``."""
+    grads = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    norms = th.linalg.vector_norm(th.stack([th.linalg.vector_norm(g.flatten(1), dim=1) for g in grads], dim=1), dim=1)
+    scale = th.clamp(max_norm / (norms + 1e-6), max=1.0)
+    for grad in grads:
+        grad.mul_(scale.view(-1, *([1] * (grad.dim() - 1))))
+    return norms
+
+
+def _check_sizes(rollout_size: int, batch_size: int, n_envs_per_client: int) -> None:
+    if rollout_size % n_envs_per_client:
+        raise ValueError(
+            f"n_envs_per_client={n_envs_per_client} must divide rollout_size={rollout_size}, the steps per client and round"
+        )
+    if not 1 < batch_size <= rollout_size:
+        raise ValueError(f"batch_size={batch_size} must lie between 2 and rollout_size={rollout_size}; both are per client")

@@ -1,0 +1,241 @@
+"""What every federation has, whatever its learner: clients, random streams, an offline stage, a server and rounds."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from fed_envs import FederatedVecEnv
+from sb3_fedguide.common.callbacks import ExchangeCallback, RoundProgressCallback
+from sb3_fedguide.common.export import client_model
+from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.policies import StackedMlpPolicy
+from sb3_fedguide.common.seeding import Role, stream
+from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
+from sb3_fedguide.server.strategy import Payload, Strategy
+
+PolicyLike = str | type[ActorCriticPolicy]
+FederationLike = str | Path | Any | Sequence[Callable[[], gym.Env]]
+
+
+class Federation(BaseAlgorithm):
+    """Mixin for SB3 algorithms that train all clients of a family in lockstep.
+
+    A method defines the server's side with :meth:`_make_strategy`, the client's with :meth:`upload` and :meth:`receive`,
+    and its part of the offline stage with :meth:`_pretrain`.
+    """
+
+    policy: StackedMlpPolicy  # type: ignore[assignment]
+    normalizer: FederatedNormalizer
+    rollout_size: int
+    #: whether the broadcast policy differs from the deployed one and deserves an evaluation of its own
+    shares_policy: ClassVar[bool] = False
+
+    def _init_federation(
+        self,
+        env: FederatedVecEnv | None,
+        normalize: bool,
+        bc_weight: float,
+        pretraining: PretrainingConfig | dict[str, Any] | None,
+        cache_dir: str | Path | None,
+    ) -> None:
+        """Called by a subclass's constructor, before SB3's."""
+        if not 0.0 <= bc_weight <= 1.0:
+            raise ValueError(f"bc_weight={bc_weight} must lie in [0, 1]")
+        self.client_ids: list[int] = [] if env is None else list(env.client_ids)
+        self.n_envs_per_client = 1 if env is None else env.n_envs_per_client
+        self.family = None if env is None else env.family
+        self.normalize = normalize
+        self.bc_weight = bc_weight
+        self.pretraining_config = PretrainingConfig.model_validate(pretraining or {})
+        self.cache_dir = cache_dir
+        self.round = 0
+        self.pretrained = False
+        self.strategy: Strategy | None = None
+        self._streams: dict[Role, list[np.random.Generator]] = {}
+
+    @staticmethod
+    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """Accept whatever a federation can be made of wherever SB3 takes an environment, as in ``load(path, env=...)``."""
+        wrapped = as_federated_env(env)
+        assert wrapped is not None
+        return BaseAlgorithm._wrap_env(wrapped, verbose, monitor_wrapper)
+
+    @property
+    def n_clients(self) -> int:
+        """Clients that live here."""
+        return len(self.client_ids)
+
+    def streams(self, role: Role) -> list[np.random.Generator]:
+        """Each local client's own generator for one purpose."""
+        if role not in self._streams:
+            assert self.seed is not None
+            self._streams[role] = [stream(self.seed, role, client) for client in self.client_ids]
+        return self._streams[role]
+
+    # -- what a method defines ---------------------------------------------------------------------------------------
+
+    def _make_strategy(self) -> Strategy | None:
+        """The server's side of this method; ``None`` where nothing is exchanged."""
+        return None
+
+    def upload(self, index: int) -> Payload:
+        """What the client at position ``index`` sends: float32 arrays and nothing else."""
+        return {}
+
+    def receive(self, index: int, broadcast: Payload) -> None:
+        """Take what the server sent to the client at position ``index``."""
+
+    def _pretrain(self, stage: Pretraining) -> None:
+        """A method's own part of the offline stage."""
+
+    # -- offline stage -----------------------------------------------------------------------------------------------
+
+    def pretrain(self, progress_bar: bool = False) -> None:
+        """The offline stage: behaviour cloning and whatever the method needs; results are cached. Runs at most once.
+
+        :raises ValueError: where the method needs offline data and none can be had
+        """
+        if self.pretrained:
+            return
+        assert self.seed is not None
+        stage = Pretraining(
+            self.family,
+            self.client_ids,
+            self.pretraining_config,
+            seed=self.seed,
+            cache_dir=self.cache_dir,
+            progress_bar=progress_bar,
+        )
+        if self.bc_weight > 0:
+            self._initialize_from_behavior_cloning(stage)
+        self._pretrain(stage)
+        self.pretrained = True
+
+    @th.no_grad()
+    def _initialize_from_behavior_cloning(self, stage: Pretraining) -> None:
+        """theta_0 = (1 - alpha) theta_rand + alpha theta_BC, both from the same initial actor.
+
+        With running normalisation, each client's observation statistics start from its own offline data, in whose scale
+        the actor was cloned.
+        """
+        if self.normalize:
+            for index, data in enumerate(stage.datasets()):
+                obs = data.observations.astype(np.float64)
+                self.normalizer.warm_start(index, obs.mean(axis=0), obs.var(axis=0), len(obs))
+        cloned = stage.behavior_cloning(self.policy.actor(), normalize=self.normalize)
+        for name, tensor in cloned.items():
+            self.policy.actor_parameter(name).lerp_(tensor.to(self.device), self.bc_weight)
+
+    # -- rounds ------------------------------------------------------------------------------------------------------
+
+    def _round_callbacks(self, callback: MaybeCallback, total_timesteps: int, progress_bar: bool) -> CallbackList:
+        """The exchange first, then the user's callbacks, which see its result, then the progress bar."""
+        chain: list[BaseCallback] = [ExchangeCallback()]
+        for item in callback if isinstance(callback, list) else [callback]:
+            if item is not None:
+                chain.append(item if isinstance(item, BaseCallback) else ConvertCallback(item))
+        if progress_bar:
+            chain.append(RoundProgressCallback(total_timesteps))
+        return CallbackList(chain)
+
+    def _begin_learning(self, environments_were_reset: bool) -> None:
+        if environments_were_reset:
+            self.normalizer.reset_returns()
+            self.normalizer.update_obs(self._last_obs.reshape(self.n_clients, self.n_envs_per_client, -1))  # type: ignore
+        self.episode_infos: list[deque[dict[str, float]]] = [
+            deque(maxlen=self._stats_window_size) for _ in range(self.n_clients)
+        ]
+
+    def mean_episode_return(self) -> float:
+        """Average over clients of each one's mean return over its last finished training episodes."""
+        means = [np.mean([info["r"] for info in infos]) for infos in self.episode_infos if infos]
+        return float(np.mean(means)) if means else float("nan")
+
+    def dump_logs(self, iteration: int = 0) -> None:
+        """Write one round's log: each client is averaged first, so that those with short episodes do not dominate."""
+        for client, infos in zip(self.client_ids, self.episode_infos, strict=True):
+            if infos:
+                self.record_client(client, "ep_rew_mean", float(np.mean([info["r"] for info in infos])))
+        lengths = [np.mean([info["l"] for info in infos]) for infos in self.episode_infos if infos]
+        if lengths:
+            self.logger.record("rollout/ep_rew_mean", self.mean_episode_return())
+            self.logger.record("rollout/ep_len_mean", float(np.mean(lengths)))
+        elapsed = max((time.time_ns() - self.start_time) / 1e9, 1e-9)
+        self.logger.record("time/round", iteration)
+        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
+        self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(step=self.num_timesteps)
+
+    def record_client(self, client_id: int, key: str, value: float) -> None:
+        """Log one client's value; kept off the terminal, where long keys collide and eight clients drown the rest."""
+        self.logger.record(f"client_{client_id}/{key}", value, exclude=("stdout", "log"))
+
+    # -- use ---------------------------------------------------------------------------------------------------------
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray,
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """Actions of all clients for raw observations, ``(n_clients * batch, obs_dim)``, client-major.
+
+        :raises ValueError: where the observations cannot be divided among the clients
+        """
+        observation = np.asarray(observation)
+        if observation.ndim != 2 or len(observation) % self.n_clients:
+            raise ValueError(
+                f"predict() takes observations of all {self.n_clients} clients, client by client, but got shape "
+                f"{observation.shape}; take one client's own model with client(k)"
+            )
+        split = observation.reshape(self.n_clients, -1, observation.shape[-1])
+        normalized = self.normalizer.normalize_obs(split).reshape(observation.shape)
+        return self.policy.predict(normalized, state, episode_start, deterministic)
+
+    def client(self, client_id: int) -> PPO:
+        """Client ``client_id``'s policy as an ordinary ``stable_baselines3.PPO`` that takes raw observations.
+
+        :raises ValueError: for a client that does not live here
+        """
+        if client_id not in self.client_ids:
+            raise ValueError(f"no client {client_id} here; this federation holds the clients {self.client_ids}")
+        return client_model(self, self.client_ids.index(client_id))
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "normalizer", "episode_infos"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer", "normalizer"], []
+
+
+def as_federated_env(
+    env: FederationLike | None, n_envs_per_client: int = 1, clients: Sequence[int] | None = None
+) -> FederatedVecEnv | None:
+    """A ``FederatedVecEnv`` from a family name, metadata file, ``Family`` or list of factories.
+
+    :raises ValueError: for an environment that holds a single client
+    """
+    if env is None or isinstance(env, FederatedVecEnv):
+        return env
+    if isinstance(env, VecEnv | gym.Env):
+        raise ValueError(
+            f"a federation needs one environment per client, but got a single {type(env).__name__}; pass a family name, "
+            "a metadata file, a fed_envs.FederatedVecEnv or a list of environment factories"
+        )
+    return FederatedVecEnv(env, n_envs_per_client=n_envs_per_client, clients=clients)

@@ -1,0 +1,127 @@
+"""Running normalisation of observations and rewards: ``VecNormalize``'s semantics, with statistics per client.
+
+The statistics are private to their client. They are kept with the model and not in an environment wrapper, so that
+``predict``, ``save`` and ``client(k)`` take raw observations, and priors and DICE values see them raw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch as th
+
+
+class RunningMoments:
+    """Mean and variance of a stream per client, updated batch by batch (Chan's parallel formula, as in SB3).
+
+    :param n_clients: leading dimension of every array
+    :param shape: shape of one sample
+    """
+
+    def __init__(self, n_clients: int, shape: tuple[int, ...], epsilon: float = 1e-4) -> None:
+        self.mean = np.zeros((n_clients, *shape))
+        self.var = np.ones((n_clients, *shape))
+        self.count = np.full((n_clients, *([1] * len(shape))), epsilon)
+
+    def update(self, batch: np.ndarray) -> None:
+        """:param batch: ``(n_clients, n_samples, *shape)``"""
+        if batch.shape[1] == 1:  # the usual case in a rollout: the batch is its own mean
+            self._merge(batch[:, 0], 0.0, 1)
+        else:
+            self._merge(batch.mean(axis=1), batch.var(axis=1), batch.shape[1])
+
+    def _merge(self, mean: np.ndarray, var: np.ndarray | float, count: int) -> None:
+        delta = mean - self.mean
+        total = self.count + count
+        self.mean += delta * (count / total)
+        m2 = self.var * self.count + var * count + np.square(delta) * (self.count * count / total)
+        self.var = m2 / total
+        self.count = total
+
+
+class FederatedNormalizer:
+    """Per-client normalisation with the defaults of ``VecNormalize``.
+
+    :param n_clients: clients in lockstep
+    :param n_envs_per_client: environments of each
+    :param obs_dim: observation size
+    :param gamma: discount of the running return whose deviation scales rewards
+    :param norm_obs: normalise observations
+    :param norm_reward: normalise rewards
+    """
+
+    CLIP = 10.0
+    EPSILON = 1e-8
+
+    def __init__(
+        self,
+        n_clients: int,
+        n_envs_per_client: int,
+        obs_dim: int,
+        gamma: float,
+        norm_obs: bool = True,
+        norm_reward: bool = True,
+    ) -> None:
+        self.gamma, self.norm_obs, self.norm_reward = gamma, norm_obs, norm_reward
+        self.obs = RunningMoments(n_clients, (obs_dim,))
+        self.ret = RunningMoments(n_clients, ())
+        self.returns = np.zeros((n_clients, n_envs_per_client))
+
+    def update_obs(self, obs: np.ndarray) -> None:
+        """:param obs: raw, ``(n_clients, n_envs_per_client, obs_dim)``"""
+        if self.norm_obs:
+            self.obs.update(obs)
+
+    def normalize_obs(self, obs: np.ndarray, index: int | None = None) -> np.ndarray:
+        """Normalised float32 observations.
+
+        :param obs: ``(n_clients, batch, obs_dim)``, or ``(..., obs_dim)`` of the client at position ``index``
+        """
+        if not self.norm_obs:
+            return obs.astype(np.float32, copy=False)
+        if index is None:
+            mean, var = self.obs.mean[:, None], self.obs.var[:, None]
+        else:
+            mean, var = self.obs.mean[index], self.obs.var[index]
+        scaled = (obs - mean) / np.sqrt(var + self.EPSILON)
+        return np.clip(scaled, -self.CLIP, self.CLIP).astype(np.float32)
+
+    def scale_reward(self, rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
+        """Account for one step's rewards and scale them; both ``(n_clients, n_envs_per_client)``."""
+        if not self.norm_reward:
+            return rewards
+        self.returns = self.returns * self.gamma + rewards
+        self.ret.update(self.returns)
+        scaled = np.clip(rewards / self.reward_deviation[:, None], -self.CLIP, self.CLIP)
+        self.returns[dones] = 0.0
+        return scaled
+
+    @property
+    def reward_deviation(self) -> np.ndarray:
+        """What rewards are divided by, ``(n_clients,)``; ones where rewards are not normalised."""
+        return np.sqrt(self.ret.var + self.EPSILON) if self.norm_reward else np.ones_like(self.ret.var)
+
+    def reset_returns(self) -> None:
+        """Forget the running returns: the environments have been reset."""
+        self.returns[:] = 0.0
+
+    def warm_start(self, index: int, mean: np.ndarray, var: np.ndarray, count: int) -> None:
+        """Start client ``index``'s observation statistics from its own offline data."""
+        self.obs.mean[index], self.obs.var[index], self.obs.count[index] = mean, var, count
+
+    def _arrays(self) -> dict[str, tuple[object, str]]:
+        named = {f"{kind}.{name}": (getattr(self, kind), name) for kind in ("obs", "ret") for name in ("mean", "var", "count")}
+        return {**named, "returns": (self, "returns")}
+
+    def state_dict(self) -> dict[str, th.Tensor]:
+        """Copies of all statistics as tensors, for SB3's ``save``."""
+        return {name: th.as_tensor(getattr(owner, key).copy()) for name, (owner, key) in self._arrays().items()}
+
+    def load_state_dict(self, state: Mapping[str, th.Tensor], strict: bool = True) -> None:
+        """:raises KeyError: where ``strict`` and an entry is missing"""
+        for name, (owner, key) in self._arrays().items():
+            if name == "returns" and name in state and state[name].shape != self.returns.shape:
+                continue  # loaded for another number of environments: they begin new episodes
+            if strict or name in state:
+                setattr(owner, key, state[name].numpy().copy())

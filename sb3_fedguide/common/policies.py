@@ -1,0 +1,185 @@
+"""The clients' actor-critic networks, stacked along a leading client dimension."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_fedguide.common import gaussian
+from sb3_fedguide.common.stacked import client_state, stack_module, stack_tensor
+
+ACTOR_PREFIXES = ("mlp_extractor.policy_net.", "action_net.", "log_std")
+CRITIC_PREFIXES = ("mlp_extractor.value_net.", "value_net.")
+
+
+class StackedActor(nn.Module):
+    """The clients' actors alone: ``(n_clients, batch, obs_dim)`` to mean actions ``(n_clients, batch, action_dim)``."""
+
+    def __init__(self, policy_net: nn.Module, action_net: nn.Module) -> None:
+        super().__init__()
+        self.policy_net = policy_net
+        self.action_net = action_net
+
+    def forward(self, obs: th.Tensor) -> th.Tensor:
+        return self.action_net(self.policy_net(obs))
+
+
+class StackedMlpPolicy(ActorCriticPolicy):
+    """SB3's ``MlpPolicy`` for ``n_clients`` clients at once.
+
+    Parameters keep SB3's names and gain a leading client dimension, so client k's slice of the state dict is the state
+    dict of an ordinary ``MlpPolicy``. Observations and actions are client-major: ``(n_clients, batch, dim)`` inside,
+    ``(n_clients * batch, dim)`` in :meth:`predict`. Every client starts from the same network, drawn from ``init_seed``.
+
+    :param n_clients: number of networks
+    :param init_seed: seed of the initial network, one for the whole federation
+    :param net_arch: as in SB3; actor and critic may differ, ``dict(pi=[64, 64], vf=[64, 64])``
+    :param activation_fn: activation module class
+    :param log_std_init: initial value of the state-independent log standard deviation
+    :raises ValueError: for spaces other than flat ``Box`` observations and ``Box`` actions
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
+        n_clients: int = 1,
+        init_seed: int = 0,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.Tanh,
+        ortho_init: bool = True,
+        use_sde: bool = False,
+        log_std_init: float = 0.0,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        for name, space in (("observation", observation_space), ("action", action_space)):
+            if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+                raise ValueError(
+                    f"a federation needs one-dimensional Box spaces, but the {name} space is {space}; "
+                    "flatten it (gymnasium.wrappers.FlattenObservation) or use a continuous action space"
+                )
+        if use_sde:
+            raise ValueError("use_sde=True is not supported by lockstep policies; use the default Gaussian exploration")
+        self.n_clients = n_clients
+        self.init_seed = init_seed
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=net_arch,
+            activation_fn=activation_fn,
+            ortho_init=ortho_init,
+            log_std_init=log_std_init,
+            features_extractor_class=FlattenExtractor,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+        )
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        with th.random.fork_rng(devices=[]):
+            th.manual_seed(self.init_seed)
+            super()._build(lr_schedule)  # one ordinary network ...
+        self.mlp_extractor.policy_net = stack_module(self.mlp_extractor.policy_net, self.n_clients)  # ... copied for each
+        self.mlp_extractor.value_net = stack_module(self.mlp_extractor.value_net, self.n_clients)
+        self.action_net = stack_module(self.action_net, self.n_clients)
+        self.value_net = stack_module(self.value_net, self.n_clients)
+        self.log_std = nn.Parameter(stack_tensor(self.log_std, self.n_clients))
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+
+    def _build_mlp_extractor(self) -> None:
+        # On the CPU first, so that one seed gives one initial network on every device.
+        self.mlp_extractor = MlpExtractor(
+            self.features_dim, net_arch=self.net_arch, activation_fn=self.activation_fn, device="cpu"
+        )
+
+    def actor_mean(self, obs: th.Tensor) -> th.Tensor:
+        """Mean of the Gaussian policy; ``obs`` ``(n_clients, batch, obs_dim)`` to ``(n_clients, batch, action_dim)``."""
+        return self.action_net(self.mlp_extractor.policy_net(obs))
+
+    def values(self, obs: th.Tensor) -> th.Tensor:
+        """The critics' values, ``(n_clients, batch)``."""
+        return self.value_net(self.mlp_extractor.value_net(obs)).squeeze(-1)
+
+    def actor(self) -> StackedActor:
+        """A copy of the actors by themselves, for behaviour cloning."""
+        return StackedActor(copy.deepcopy(self.mlp_extractor.policy_net), copy.deepcopy(self.action_net))
+
+    def actor_parameter(self, name: str) -> nn.Parameter:
+        """This policy's parameter that a :class:`StackedActor` calls ``name``."""
+        return self.get_parameter(name if name.startswith("action_net.") else f"mlp_extractor.{name}")
+
+    def split_clients(self, obs: th.Tensor) -> th.Tensor:
+        """``(n_clients * batch, obs_dim)``, client-major, to ``(n_clients, batch, obs_dim)``.
+
+        :raises ValueError: where the rows cannot be divided among the clients
+        """
+        if obs.dim() == 3 and obs.shape[0] == self.n_clients:
+            return obs
+        if obs.shape[0] % self.n_clients:
+            raise ValueError(
+                f"{obs.shape[0]} observation(s) cannot be divided among {self.n_clients} clients; pass the same number for "
+                "each, client by client, or take one client's own model with client(k)"
+            )
+        return obs.reshape(self.n_clients, -1, obs.shape[-1])
+
+    def forward(self, obs: th.Tensor, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Actions, values and log-probabilities, client-major and flat as SB3 returns them."""
+        obs = self.split_clients(obs)
+        mean = self.actor_mean(obs)
+        actions = mean if deterministic else mean + th.randn_like(mean) * self.log_std.exp().unsqueeze(1)
+        log_prob = gaussian.log_prob(mean, self.log_std, actions)
+        return actions.flatten(0, 1), self.values(obs).reshape(-1, 1), log_prob.flatten()
+
+    def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+        """Values, log-probabilities and entropy of stored actions, client-major and flat as SB3 returns them."""
+        assert isinstance(obs, th.Tensor)
+        obs = self.split_clients(obs)
+        mean = self.actor_mean(obs)
+        log_prob = gaussian.log_prob(mean, self.log_std, actions.reshape(mean.shape))
+        entropy = gaussian.entropy(self.log_std).unsqueeze(1).expand_as(log_prob)
+        return self.values(obs).reshape(-1, 1), log_prob.flatten(), entropy.flatten()
+
+    def predict_values(self, obs: PyTorchObs) -> th.Tensor:
+        assert isinstance(obs, th.Tensor)
+        return self.values(self.split_clients(obs)).reshape(-1, 1)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.forward(observation, deterministic)[0]  # type: ignore[arg-type]
+
+    def get_distribution(self, obs: PyTorchObs) -> Any:
+        raise ValueError("a stacked policy has no single distribution; take one client's policy with client(k).policy")
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        keys = ("n_clients", "init_seed", "net_arch", "activation_fn", "ortho_init", "log_std_init")
+        keys += ("optimizer_class", "optimizer_kwargs")
+        data: dict[str, Any] = {key: getattr(self, key) for key in keys}
+        data.update(
+            observation_space=self.observation_space, action_space=self.action_space, lr_schedule=self._dummy_schedule
+        )
+        return data
+
+    def client_state_dict(self, index: int) -> dict[str, th.Tensor]:
+        """State dict of the ordinary ``MlpPolicy`` of the client at position ``index``; copies, not aliases."""
+        return client_state(self.state_dict(), index)
+
+    @th.no_grad()
+    def load_client(self, index: int, arrays: dict[str, np.ndarray]) -> None:
+        """Copy parameters, named as in SB3 and unstacked, into the client at position ``index``.
+
+        :raises ValueError: for an unknown name or a wrong shape
+        """
+        parameters = dict(self.named_parameters())
+        for name, array in arrays.items():
+            if name not in parameters or parameters[name].shape[1:] != array.shape:
+                raise ValueError(f"parameter {name!r} of shape {array.shape} does not fit this policy")
+            parameters[name][index].copy_(th.as_tensor(array))

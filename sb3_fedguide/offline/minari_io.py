@@ -1,0 +1,118 @@
+"""Offline data as Minari datasets, read and written by path so that Minari's environment variable stays untouched."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import minari
+import numpy as np
+from minari.data_collector.episode_buffer import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
+
+from sb3_fedguide.offline.data import OfflineData
+
+__all__ = ["check_spaces", "find_dataset", "read_minari", "write_minari"]
+
+
+def write_minari(
+    folder: Path,
+    dataset_id: str,
+    data: OfflineData,
+    observation_space: gym.spaces.Box,
+    action_space: gym.spaces.Box,
+    metadata: dict[str, Any],
+) -> None:
+    """Write ``data`` as the Minari dataset ``dataset_id`` into ``folder`` (its ``data`` subfolder), one episode each."""
+    ends = np.flatnonzero(data.episode_ends)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    episodes = []
+    for start, end in zip(starts, ends, strict=True):
+        rows = slice(int(start), int(end) + 1)
+        truncations = np.zeros(end + 1 - start, dtype=bool)
+        truncations[-1] = not data.terminations[end]
+        episodes.append(
+            EpisodeBuffer(
+                observations=np.concatenate([data.observations[rows], data.next_observations[end : end + 1]]),
+                actions=data.actions[rows],
+                rewards=data.rewards[rows],
+                terminations=data.terminations[rows],
+                truncations=truncations,
+            )
+        )
+    storage = MinariStorage.new(folder / "data", _as_float32(observation_space), _as_float32(action_space), data_format="hdf5")
+    storage.update_metadata({"dataset_id": dataset_id, "minari_version": minari.__version__, **metadata})
+    storage.update_episodes(episodes)
+
+
+def read_minari(data_path: Path, max_rows: int | None = None, rng: np.random.Generator | None = None) -> OfflineData:
+    """Read a Minari dataset's ``data`` folder.
+
+    :param max_rows: stop after so many rows; default all
+    :param rng: draws the order of the episodes; default as recorded
+    :raises ValueError: if there is no readable dataset with Box observations and actions
+    """
+    try:
+        storage = MinariStorage.read(data_path)
+        order = np.arange(storage.total_episodes)
+        if rng is not None:
+            rng.shuffle(order)
+        columns: dict[str, list[np.ndarray]] = {
+            name: [] for name in ("observations", "actions", "rewards", "next_observations", "terminations")
+        }
+        missing = max_rows if max_rows is not None else storage.total_steps
+        for episode in storage.get_episodes(order):
+            rows = min(len(episode["rewards"]), missing)
+            observations = episode["observations"]
+            columns["observations"].append(observations[:rows])
+            columns["next_observations"].append(observations[1 : rows + 1])
+            for name in ("actions", "rewards", "terminations"):
+                columns[name].append(episode[name][:rows])
+            missing -= rows
+            if missing <= 0:
+                break
+        return OfflineData(**{name: np.concatenate(parts) for name, parts in columns.items()})
+    except Exception as error:  # h5py, json, Gymnasium and NumPy each have their own for a file that is not what it should be
+        raise ValueError(f"{data_path} is not a readable Minari dataset of Box spaces: {error}") from error
+
+
+def find_dataset(dataset: str) -> Path:
+    """The ``data`` folder of a local Minari dataset, by id or by path.
+
+    :raises ValueError: if there is none; the message lists the local ones
+    """
+    path = Path(dataset).expanduser()
+    for candidate in (path, path / "data"):
+        if (candidate / "metadata.json").is_file():
+            return candidate
+    try:
+        return Path(str(minari.load_dataset(dataset).storage.data_path))
+    except (FileNotFoundError, ValueError) as error:
+        local = ", ".join(minari.list_local_datasets()) or "none"
+        raise ValueError(
+            f"no Minari dataset {dataset!r} on this machine (a path was tried, too). Local datasets: {local}. "
+            f"Fetch a public one with `minari download {dataset}`"
+        ) from error
+
+
+def check_spaces(data_path: Path, observation_space: gym.Space, action_space: gym.Space) -> None:
+    """Refuse a dataset whose spaces are not those of the client.
+
+    :raises ValueError: naming the spaces of both; observation bounds may differ, action bounds may not
+    """
+    try:
+        storage = MinariStorage.read(data_path)
+        theirs = (storage.observation_space, storage.action_space)
+    except Exception as error:  # the metadata may hold anything
+        raise ValueError(f"{data_path} is not a readable Minari dataset: {error}") from error
+    for kind, given, needed in zip(("observation", "action"), theirs, (observation_space, action_space), strict=True):
+        matches = isinstance(given, gym.spaces.Box) and isinstance(needed, gym.spaces.Box) and given.shape == needed.shape
+        if isinstance(given, gym.spaces.Box) and isinstance(needed, gym.spaces.Box) and matches and kind == "action":
+            matches = np.allclose(given.low, needed.low) and np.allclose(given.high, needed.high)
+        if not matches:
+            raise ValueError(f"the dataset at {data_path} does not fit: its {kind} space is {given}, the client's is {needed}")
+
+
+def _as_float32(space: gym.spaces.Box) -> gym.spaces.Box:
+    return gym.spaces.Box(space.low.astype(np.float32), space.high.astype(np.float32), dtype=np.float32)

@@ -1,0 +1,361 @@
+"""The cached offline stage of a federation: data, behaviour cloning, action prior, DICE value.
+
+Each piece is made when it is first asked for and kept in the cache under the hash of everything that it depends on. What is
+local to a client depends on that client's data and settings alone, and is cached per client; the trunk of the diffusion
+prior depends on all clients of the family.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from pydantic import BaseModel, ConfigDict, Field
+from torch import nn
+
+from fed_envs import Family, load_family
+from sb3_fedguide.common.seeding import Role, stream
+from sb3_fedguide.offline.behavior_cloning import clone
+from sb3_fedguide.offline.cache import arrays_hash, cache_folder, cached_arrays, content_key, write_arrays
+from sb3_fedguide.offline.datasets import OfflineData, client_datasets, normalize_observations
+from sb3_fedguide.offline.dice import DiceValue, train_dice
+from sb3_fedguide.offline.progress import Progress, TqdmProgress, stage_progress
+from sb3_fedguide.priors import DiffusionPrior, GaussianPrior, HeadStatistics, Prior
+
+__all__ = ["PretrainedPrior", "Pretraining", "PretrainingConfig"]
+
+VERSION = 1
+"""Raised whenever the same inputs give other results, so that old cache entries are not taken for new ones."""
+
+Arrays = dict[str, np.ndarray]
+Count = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+class PretrainingConfig(BaseModel):
+    """Settings of the offline stage.
+
+    Lengths are in updates. ``*_epochs`` lengthens a piece to so many passes over the data; the updates are then a floor
+    (40 epochs of 5,000 rows are only 400 updates and leave a network untrained).
+
+    :param dataset: a Minari dataset (id or path, ``{client}`` stands for the client's number) instead of one made on the spot
+    :param dataset_size: rows per client; default 20,000, or 1,000 for Bandit2D; a given dataset is used whole
+    :param gamma: discount factor of the DICE value
+    :param prior: ``"gaussian"`` (state-independent), ``"diffusion"``, or ``"auto"``: Gaussian for Bandit2D
+    :param prior_average_every: updates between two averages of the trunk over the clients
+    :param dice_v_coef: coefficient of V in its loss: a number, or ``"1-gamma"`` as printed in the paper
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    dataset: str | None = None
+    dataset_size: Count | None = None
+    gamma: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.99
+
+    bc_updates: Count = 2000
+    bc_epochs: Count | None = None
+    bc_batch_size: Count = 512
+    bc_learning_rate: Positive = 3e-4
+
+    prior: Literal["auto", "gaussian", "diffusion"] = "auto"
+    prior_updates: Count = 5000
+    prior_epochs: Count | None = None
+    prior_batch_size: Count = 256
+    prior_learning_rate: Positive = 1e-3
+    prior_width: Count = 64
+    prior_average_every: Count = 50
+
+    dice_updates: Count = 5000
+    dice_epochs: Count | None = None
+    dice_batch_size: Count = 128
+    dice_learning_rate: Positive = 1e-4
+    dice_width: Count = 256
+    dice_omega: Positive = 0.5
+    dice_f: Literal["soft_chi", "kl", "chi2"] = "soft_chi"
+    dice_v_coef: float | Literal["1-gamma"] = 1.0
+
+    def n_updates(self, piece: Literal["bc", "prior", "dice"], n_rows: int) -> int:
+        """Updates of a piece on ``n_rows`` rows: its floor, or its epochs if these are more."""
+        floor, epochs = getattr(self, f"{piece}_updates"), getattr(self, f"{piece}_epochs")
+        return max(floor, (epochs or 0) * math.ceil(n_rows / getattr(self, f"{piece}_batch_size")))
+
+    def settings(self, *pieces: str) -> dict[str, Any]:
+        """The fields that begin with one of ``pieces``, for a cache key; lengths are not among them."""
+        return {
+            name: value
+            for name, value in self.model_dump(mode="json").items()
+            if name.split("_")[0] in pieces and not name.endswith(("_updates", "_epochs"))
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class PretrainedPrior:
+    """What :meth:`Pretraining.prior` gives, clients in the order of ``client_ids``.
+
+    :param prior: the frozen common part
+    :param heads: ``(N, action_dim, p + 1)``, float32
+    :param moments: ``(N, p + 1, p + 1)``, float64, the moments ``S_i`` of the score cost; they stay with their client
+    :param statistics: the offline data's sufficient statistics of each head
+    :param bytes_up: what each client uploaded while the trunk was trained
+    :param bytes_down: what was sent to each client
+    """
+
+    prior: Prior
+    heads: np.ndarray
+    moments: np.ndarray
+    statistics: list[HeadStatistics]
+    bytes_up: int
+    bytes_down: int
+
+
+class Pretraining:
+    """The offline stage of some clients of a federation.
+
+    :param family: a family's name, metadata file or object; ``None`` for environments of one's own
+    :param client_ids: the clients that live here
+    :param config: settings, default ``PretrainingConfig()``
+    :param seed: the federation's seed
+    :param cache_dir: default ``$FEDGUIDE_CACHE`` or ``~/.cache/fedguide``
+    :param progress_bar: draw a bar per piece
+    :param progress: called with ``(stage, done, total)`` instead
+    :param env_spaces: observation and action space, checked against a given dataset; needed if ``family`` is ``None``
+    :raises ValueError: if there is neither a family nor a dataset
+    """
+
+    def __init__(
+        self,
+        family: str | Path | Family | None,
+        client_ids: Sequence[int],
+        config: PretrainingConfig | None = None,
+        seed: int = 0,
+        cache_dir: str | Path | None = None,
+        progress_bar: bool = False,
+        progress: Progress | None = None,
+        env_spaces: tuple[spaces.Space, spaces.Space] | None = None,
+    ) -> None:
+        self.family = None if family is None else load_family(family)
+        self.client_ids = list(client_ids)
+        self.config = config or PretrainingConfig()
+        self.seed = seed
+        self.cache = cache_folder(cache_dir)
+        self.env_spaces = env_spaces
+        self._progress = progress if progress is not None else TqdmProgress() if progress_bar else None
+        self._data: dict[int, OfflineData] = {}
+        self._trunk: tuple[Prior, int, int] | None = None
+
+    def datasets(self, client_ids: Sequence[int] | None = None) -> list[OfflineData]:
+        """Offline data of the clients that live here, or of ``client_ids``.
+
+        :raises ValueError: for a dataset that does not exist or fit, or environments of one's own without one
+        """
+        wanted = self.client_ids if client_ids is None else list(client_ids)
+        missing = [client for client in wanted if client not in self._data]
+        if missing:
+            data = client_datasets(
+                self.family,
+                self.config.dataset_size,
+                self.seed,
+                self.cache,
+                self.config.dataset,
+                missing,
+                env_spaces=self.env_spaces,
+                progress=stage_progress(self._progress, "data"),
+            )
+            self._data.update(zip(missing, data, strict=True))
+        return [self._data[client] for client in wanted]
+
+    def behavior_cloning(self, actor: nn.Module, normalize: bool = True) -> dict[str, th.Tensor]:
+        """The actors after behaviour cloning, theta_BC; ``actor`` itself is left as it is.
+
+        :param actor: the initial actors, stacked: ``(N, batch, obs_dim)`` to mean actions ``(N, batch, action_dim)``
+        :param normalize: observations are normalised by the moments of each client's own data
+        :return: the parameters by name, ``(N, ...)`` each
+        """
+        data, config = self.datasets(), self.config
+        initial = {name: tensor.detach().cpu().numpy() for name, tensor in actor.named_parameters()}
+        structure = [
+            type(module).__name__ if next(module.parameters(), None) is not None else repr(module)
+            for module in actor.modules()
+        ]
+        keys = [
+            self._client_key(
+                index,
+                "bc",
+                normalize=normalize,
+                structure=structure,
+                initial=arrays_hash({name: array[index] for name, array in initial.items()}),
+            )
+            for index in range(len(data))
+        ]
+
+        def train(group: list[int], n_updates: int) -> list[Arrays]:
+            actors = _take_clients(actor, group)
+            observations = [
+                normalize_observations(data[k].observations, *data[k].moments()) if normalize else data[k].observations
+                for k in group
+            ]
+            clone(
+                actors,
+                observations,
+                [data[k].actions for k in group],
+                [stream(self.seed, Role.BEHAVIOR_CLONING, self.client_ids[k]) for k in group],
+                n_updates,
+                config.bc_batch_size,
+                config.bc_learning_rate,
+                progress=stage_progress(self._progress, "behaviour cloning"),
+            )
+            return [_client_arrays(actors.named_parameters(), k) for k in range(len(group))]
+
+        entries = self._per_client("bc", keys, train)
+        return {name: th.from_numpy(np.stack([entry[name] for entry in entries])) for name in initial}
+
+    def trunk(self) -> tuple[Prior, int, int]:
+        """The common, frozen part of the priors, and the bytes that each client sent and received for it.
+
+        All clients of the family take part, wherever they live: otherwise a client's prior would depend on its neighbours.
+        """
+        if self._trunk is None:
+            self._trunk = self._gaussian() if self._prior_kind() == "gaussian" else self._diffusion()
+        return self._trunk
+
+    def prior(self) -> PretrainedPrior:
+        """The action priors: the common part, and each client's head fitted on its own data in closed form."""
+        prior, bytes_up, bytes_down = self.trunk()
+        data = self.datasets()
+        common = arrays_hash({name: tensor.numpy() for name, tensor in prior.state_dict().items()})
+        keys = [self._client_key(k, "prior", common=common, kind=type(prior).__name__) for k in range(len(data))]
+
+        def fit(group: list[int], n_updates: int) -> list[Arrays]:
+            entries = []
+            for k in group:
+                rng = stream(self.seed, Role.HEAD, self.client_ids[k])
+                statistics = prior.head_statistics(data[k].observations, data[k].actions, rng)
+                moment = prior.feature_moment(data[k].observations, data[k].actions, rng)
+                entries.append(
+                    {"head": prior.solve_head(statistics), "moment": moment, "gram": statistics.gram,
+                     "cross": statistics.cross, "weight": np.asarray(statistics.weight)}
+                )  # fmt: skip
+            return entries
+
+        entries = self._per_client("prior", keys, fit)
+        return PretrainedPrior(
+            prior,
+            np.stack([entry["head"] for entry in entries]),
+            np.stack([entry["moment"] for entry in entries]),
+            [HeadStatistics(entry["gram"], entry["cross"], float(entry["weight"])) for entry in entries],
+            bytes_up,
+            bytes_down,
+        )
+
+    def dice(self) -> DiceValue:
+        """The clients' DICE values, stacked and frozen."""
+        data, config = self.datasets(), self.config
+        keys = [self._client_key(k, "dice", gamma=config.gamma) for k in range(len(data))]
+
+        def train(group: list[int], n_updates: int) -> list[Arrays]:
+            value = train_dice(
+                [data[k] for k in group],
+                [stream(self.seed, Role.DICE, self.client_ids[k]) for k in group],
+                n_updates,
+                config.dice_batch_size,
+                config.dice_width,
+                config.dice_omega,
+                config.dice_learning_rate,
+                config.gamma,
+                f=config.dice_f,
+                v_coef=config.dice_v_coef,
+                progress=stage_progress(self._progress, "DICE"),
+            )
+            return [_client_arrays(value.state_dict().items(), k) for k in range(len(group))]
+
+        entries = self._per_client("dice", keys, train)
+        value = DiceValue(len(data), data[0].observations.shape[1], config.dice_width)
+        value.load_state_dict({name: th.from_numpy(np.stack([entry[name] for entry in entries])) for name in entries[0]})
+        return value.requires_grad_(False)
+
+    def _prior_kind(self) -> str:
+        if self.config.prior != "auto":
+            return self.config.prior
+        return "gaussian" if self.family is not None and self.family.world == "bandit2d" else "diffusion"
+
+    def _gaussian(self) -> tuple[Prior, int, int]:
+        data = self.datasets()[0]
+        return GaussianPrior(data.observations.shape[1], data.actions.shape[1]), 0, 0
+
+    def _diffusion(self) -> tuple[Prior, int, int]:
+        config = self.config
+        everyone = range(self.family.n_clients) if self.family is not None else self.client_ids
+        data = self.datasets(everyone)
+        n_updates = max(config.n_updates("prior", len(rows)) for rows in data)
+        prior = DiffusionPrior(data[0].observations.shape[1], data[0].actions.shape[1], width=config.prior_width)
+        key = content_key(
+            version=VERSION, seed=self.seed, clients=list(everyone), data=[rows.content_hash for rows in data],
+            n_updates=n_updates, **config.settings("prior"),
+        )  # fmt: skip
+
+        def build() -> Arrays:
+            from sb3_fedguide.offline.trunk import federated_trunk
+
+            trained = federated_trunk(
+                prior,
+                [(rows.observations, rows.actions) for rows in data],
+                [stream(self.seed, Role.TRUNK, client) for client in everyone],
+                n_updates,
+                config.prior_average_every,
+                progress=stage_progress(self._progress, "prior"),
+            )
+            arrays = {f"state/{name}": tensor.numpy() for name, tensor in trained.prior.state_dict().items()}
+            return {**arrays, "bytes_up": np.asarray(trained.bytes_up), "bytes_down": np.asarray(trained.bytes_down)}
+
+        arrays = cached_arrays(self.cache / "pretraining" / "trunk" / f"{key}.npz", build)
+        if arrays is None:
+            raise RuntimeError("the trunk was neither cached nor built")
+        state = {name: th.from_numpy(array) for name, array in arrays.items() if name.startswith("state/")}
+        prior.load_state_dict({name.removeprefix("state/"): tensor for name, tensor in state.items()})
+        return prior.requires_grad_(False), int(arrays["bytes_up"]), int(arrays["bytes_down"])
+
+    def _client_key(self, index: int, piece: Literal["bc", "prior", "dice"], **more: Any) -> str:
+        """Cache key of one client's part of a piece: its own data, settings and stream, and nothing of other clients."""
+        client = self.client_ids[index]
+        data = self._data[client]
+        return content_key(
+            version=VERSION, piece=piece, seed=self.seed, client=client, data=data.content_hash,
+            n_updates=self.config.n_updates(piece, len(data)), **self.config.settings(piece), **more,
+        )  # fmt: skip
+
+    def _per_client(
+        self, piece: Literal["bc", "prior", "dice"], keys: Sequence[str], train: Callable[[list[int], int], list[Arrays]]
+    ) -> list[Arrays]:
+        """Every client's entry; those that are not cached are trained together, and each is stored by itself."""
+        paths = [self.cache / "pretraining" / piece / f"{key}.npz" for key in keys]
+        entries: list[Arrays | None] = [cached_arrays(path) for path in paths]
+        # In lockstep all train equally long, and a client's length is its own: one group per length.
+        groups: dict[int, list[int]] = defaultdict(list)
+        for k, client in enumerate(self.client_ids):
+            if entries[k] is None:
+                groups[self.config.n_updates(piece, len(self._data[client]))].append(k)
+        for n_updates, group in groups.items():
+            for k, arrays in zip(group, train(group, n_updates), strict=True):
+                write_arrays(paths[k], arrays)
+                entries[k] = arrays
+        return [entry for entry in entries if entry is not None]
+
+
+def _take_clients(module: nn.Module, indices: list[int]) -> nn.Module:
+    """A copy of a stacked module, on the CPU, with only the clients at ``indices``."""
+    taken = copy.deepcopy(module).cpu()
+    for parameter in taken.parameters():
+        parameter.data = parameter.data[indices].clone()
+    return taken.requires_grad_(True)
+
+
+def _client_arrays(named: Any, index: int) -> Arrays:
+    return {name: tensor.detach()[index].cpu().numpy().copy() for name, tensor in named}
