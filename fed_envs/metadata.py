@@ -148,9 +148,9 @@ class Family(BaseModel):
     @classmethod
     def _clients_of_the_world(cls, value: Any, info: Any) -> tuple[Client, ...]:
         if "world" not in info.data:
-            raise ValueError("not checked, since the world is not known")
+            raise ValueError("clients: not checked, since the world is not known")
         if not isinstance(value, (list, tuple)) or not value:
-            raise ValueError("must be a list of at least one client")
+            raise ValueError("clients: must be a list of at least one client")
         model = CLIENT_MODELS[info.data["world"]]
         clients: list[Client] = []
         problems: list[str] = []

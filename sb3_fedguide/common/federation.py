@@ -115,10 +115,11 @@ class Federation(BaseAlgorithm):
         stage = Pretraining(
             self.family,
             self.client_ids,
-            self.pretraining_config,
+            self.pretraining_config.model_copy(update={"gamma": self.gamma}),
             seed=self.seed,
             cache_dir=self.cache_dir,
             progress_bar=progress_bar,
+            env_spaces=(self.observation_space, self.action_space),
         )
         if self.bc_weight > 0:
             self._initialize_from_behavior_cloning(stage)
