@@ -31,15 +31,19 @@ _LAZY = {
     "FederatedVecEnv": "fed_envs.vec_env",
 }
 
+_SUBMODULES = ("bandit2d", "generation", "locomotion", "metadata", "reacher", "vec_env")
+
 
 def __getattr__(name: str) -> Any:
+    if name in _SUBMODULES:
+        return import_module(f"fed_envs.{name}")
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_LAZY[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})
+    return sorted({*globals(), *_LAZY, *_SUBMODULES})
 
 
 register_families()

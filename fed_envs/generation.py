@@ -1,8 +1,8 @@
 """New families of any size from the presets of the shipped ones.
 
 The Hopper, Walker2D and Reacher presets and the order of their random draws are the paper's: eight clients with the paper's
-seed (:data:`PAPER_SEEDS`) are the shipped families to the printed digit. The HalfCheetah jitter is ours, since the draws behind
-the paper's HalfCheetah clients are not known; ranges and presets follow its figures.
+seed (:data:`PAPER_SEEDS`) are the shipped families to the printed digit. The HalfCheetah jitter is ours, since the draws
+behind the paper's HalfCheetah clients are not known; ranges and presets follow its figures.
 """
 
 from __future__ import annotations

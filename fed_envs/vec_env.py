@@ -176,6 +176,13 @@ class FederatedVecEnv(VecEnv):
                 raise ValueError(f"expected actions of shape {(self.num_envs, *self.action_space.shape)}, got {actions.shape}")  # type: ignore[misc]
         all_active = bool(active.all())
         rows = range(self.num_envs) if all_active else np.flatnonzero(active).tolist()
+        if not np.isfinite(actions if all_active else actions[active]).all():
+            # The simulator would warn in a log file and go on without any torque.
+            row = next(row for row in rows if not np.isfinite(actions[row]).all())
+            raise ValueError(
+                f"client {self.client_ids[row // self.n_envs_per_client]}: the action {actions[row]} is not finite"
+            )
+        before = None if all_active else batch.observations[~active]
         batch.step(actions, rows, self._run if self.num_threads > 1 else run_here)
 
         rewards, terminated = batch.rewards, batch.terminated
@@ -183,16 +190,11 @@ class FederatedVecEnv(VecEnv):
         truncated = batch.truncated | (self._lengths >= self._max_steps)
         infos = batch.infos()
         dones = terminated | truncated
-        if not all_active:
+        if before is not None:
+            batch.observations[~active] = before
             rewards = np.where(active, rewards, 0.0)
             dones &= active
             infos = [info if alive else {} for info, alive in zip(infos, active, strict=True)]
-        if not np.isfinite(rewards).all():
-            row = int(np.flatnonzero(~np.isfinite(rewards))[0])
-            client, action = self.client_ids[row // self.n_envs_per_client], actions[row]
-            raise ValueError(
-                f"client {client}: the reward is {rewards[row]} after the action {action}; check the policy for NaN"
-            )
         self._returns += rewards
         if dones.any():
             for row in np.flatnonzero(dones).tolist():

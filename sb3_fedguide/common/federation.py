@@ -126,7 +126,6 @@ class Federation(BaseAlgorithm):
         self._pretrain(stage)
         self.pretrained = True
 
-    @th.no_grad()
     def _initialize_from_behavior_cloning(self, stage: Pretraining) -> None:
         """theta_0 = (1 - alpha) theta_rand + alpha theta_BC, both from the same initial actor.
 
@@ -138,8 +137,9 @@ class Federation(BaseAlgorithm):
                 obs = data.observations.astype(np.float64)
                 self.normalizer.warm_start(index, obs.mean(axis=0), obs.var(axis=0), len(obs))
         cloned = stage.behavior_cloning(self.policy.actor(), normalize=self.normalize)
-        for name, tensor in cloned.items():
-            self.policy.actor_parameter(name).lerp_(tensor.to(self.device), self.bc_weight)
+        with th.no_grad():
+            for name, tensor in cloned.items():
+                self.policy.actor_parameter(name).lerp_(tensor.to(self.device), self.bc_weight)
 
     # -- rounds ------------------------------------------------------------------------------------------------------
 

@@ -13,13 +13,13 @@ shifts V by ``omega * log(1 / (1 - gamma)) / (1 - gamma)`` for ``kl`` and stays 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch as th
 from torch import nn
+from torch.nn import functional as F
 
-from sb3_fedguide.common.stacked import StackedLinear
 from sb3_fedguide.offline.conjugates import conjugate
 from sb3_fedguide.offline.data import OfflineData
 from sb3_fedguide.offline.progress import StepProgress
@@ -28,6 +28,56 @@ __all__ = ["DiceValue", "calibrate", "explained_variance", "train_dice"]
 
 _MIN_STD = 1e-3
 _BLOCK = 250  # updates whose minibatches are drawn at once, and between two reports of progress
+
+
+class StackedMlp(nn.Module):
+    """``n_networks`` networks with two hidden ReLU layers and one output.
+
+    Weights are kept as ``(n_networks, in, out)``: their gradients then arrive in the parameters' own memory layout, which
+    saves the optimiser a transposing copy of every weight.
+    """
+
+    def __init__(self, n_networks: int, inputs: int, width: int) -> None:
+        super().__init__()
+        self.weight_0 = nn.Parameter(th.zeros(n_networks, inputs, width))
+        self.bias_0 = nn.Parameter(th.zeros(n_networks, 1, width))
+        self.weight_1 = nn.Parameter(th.zeros(n_networks, width, width))
+        self.bias_1 = nn.Parameter(th.zeros(n_networks, 1, width))
+        self.weight_2 = nn.Parameter(th.zeros(n_networks, 1, width))
+        self.bias_2 = nn.Parameter(th.zeros(n_networks, 1))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """``(n_networks, batch, inputs)`` to ``(n_networks, batch)``."""
+        x = F.relu(th.baddbmm(self.bias_0, x, self.weight_0))
+        x = F.relu(th.baddbmm(self.bias_1, x, self.weight_1))
+        # A batched product with one output column rounds differently for one network than for several.
+        return (x * self.weight_2).sum(dim=-1) + self.bias_2
+
+    def client(self, index: int, x: th.Tensor) -> th.Tensor:
+        """One network alone: ``(batch, inputs)`` to ``(batch,)``."""
+        x = F.relu(th.addmm(self.bias_0[index], x, self.weight_0[index]))
+        x = F.relu(th.addmm(self.bias_1[index], x, self.weight_1[index]))
+        return x @ self.weight_2[index, 0] + self.bias_2[index]
+
+    @th.no_grad()
+    def initialize(self, index: int, rng: np.random.Generator) -> None:
+        """PyTorch's default initialisation of linear layers for one network."""
+        for layer in range(3):
+            weight, bias = self.get_parameter(f"weight_{layer}")[index], self.get_parameter(f"bias_{layer}")[index]
+            bound = 1.0 / np.sqrt(weight.shape[1] if layer == 2 else weight.shape[0])
+            for parameter in (weight, bias):
+                parameter.copy_(th.from_numpy(rng.uniform(-bound, bound, tuple(parameter.shape))))
+
+    def parameter_groups(self) -> list[dict[str, Any]]:
+        """Groups for Adam: the fused kernel where it treats all networks alike.
+
+        It works in vectors of up to 16 numbers and rounds a remainder differently, so what a parameter learns would depend
+        on its network's position in the stack wherever a network's part is not a multiple of that.
+        """
+        fused = [parameter for parameter in self.parameters() if parameter[0].numel() % 16 == 0]
+        others = [parameter for parameter in self.parameters() if parameter[0].numel() % 16 != 0]
+        groups: list[dict[str, Any]] = [{"params": fused, "fused": True}, {"params": others, "foreach": True}]
+        return [group for group in groups if group["params"]]
 
 
 class DiceValue(nn.Module):
@@ -46,7 +96,7 @@ class DiceValue(nn.Module):
     def __init__(self, n_clients: int, obs_dim: int, width: int = 256) -> None:
         super().__init__()
         self.n_clients, self.obs_dim, self.width = n_clients, obs_dim, width
-        self.net = _empty_net(n_clients, obs_dim, width)
+        self.net = StackedMlp(n_clients, obs_dim, width)
         self.register_buffer("obs_mean", th.zeros(n_clients, 1, obs_dim))
         self.register_buffer("obs_std", th.ones(n_clients, 1, obs_dim))
         self.register_buffer("offset", th.zeros(n_clients, 1))
@@ -60,13 +110,13 @@ class DiceValue(nn.Module):
 
     def standardized(self, observations: th.Tensor) -> th.Tensor:
         """Values ``(N, batch)`` of observations that are standardised already."""
-        return self.offset + self.scale * self.net(observations).squeeze(-1)
+        return self.offset + self.scale * self.net(observations)
 
     def client_values(self, index: int, observations: np.ndarray) -> np.ndarray:
         """Values ``(n,)`` of client number ``index`` (its position in the stack) for raw observations ``(n, obs_dim)``."""
-        one = DiceValue.unstack(self, index)
+        x = (th.as_tensor(observations, dtype=th.float32) - self.obs_mean[index]) / self.obs_std[index]
         with th.no_grad():
-            return one(th.as_tensor(observations, dtype=th.float32).unsqueeze(0))[0].numpy()
+            return (self.offset[index] + self.scale[index] * self.net.client(index, x)).numpy()
 
     def unstack(self, index: int) -> DiceValue:
         """A copy with only the client at ``index``."""
@@ -126,27 +176,25 @@ def train_dice(
         value.offset[k] = float(returns.mean())
         value.scale[k] = max(float(returns.std()), _MIN_STD)
     # The two Qs of a client are neighbours in one stack of 2 N networks.
-    q_net, q_target = (_empty_net(2 * n_clients, obs_dim + action_dim, width) for _ in range(2))
+    q_net, q_target = (StackedMlp(2 * n_clients, obs_dim + action_dim, width) for _ in range(2))
     for k, rng in enumerate(rngs):
-        _initialize(value.net, k, rng)
-        _initialize(q_net, 2 * k, rng)
-        _initialize(q_net, 2 * k + 1, rng)
+        value.net.initialize(k, rng)
+        q_net.initialize(2 * k, rng)
+        q_net.initialize(2 * k + 1, rng)
     q_target.load_state_dict(q_net.state_dict())
     q_target.requires_grad_(False)
 
     rows = _Rows(datasets, value)
     offset, scale = value.offset.unsqueeze(1), value.scale.unsqueeze(1)  # (N, 1, 1): over the two Qs and the batch
 
-    def q_values(net: nn.Module, state_action: th.Tensor) -> th.Tensor:
+    def q_values(net: StackedMlp, state_action: th.Tensor) -> th.Tensor:
         twice = state_action.unsqueeze(1).expand(-1, 2, -1, -1).reshape(2 * n_clients, batch_size, -1)
         return offset + scale * net(twice).view(n_clients, 2, batch_size)
 
-    v_parameters: list[th.Tensor] = list(value.net.parameters())
     q_parameters: list[th.Tensor] = list(q_net.parameters())
     target_parameters: list[th.Tensor] = list(q_target.parameters())
-    # foreach, not fused: the fused kernel's rounding depends on a client's position in the stack.
-    v_optimizer = th.optim.Adam(v_parameters, lr=learning_rate, foreach=True)
-    q_optimizer = th.optim.Adam(q_parameters, lr=learning_rate, foreach=True)
+    v_optimizer = th.optim.Adam(value.net.parameter_groups(), lr=learning_rate)
+    q_optimizer = th.optim.Adam(q_net.parameter_groups(), lr=learning_rate)
     # The squared errors are divided by the return's scale twice and L_V once, which Adam does not see but its epsilon does.
     for start in range(0, n_updates, _BLOCK):
         block = min(_BLOCK, n_updates - start)
@@ -239,23 +287,6 @@ def explained_variance(value: DiceValue, datasets: Sequence[OfflineData], gamma:
         if returns.var() > 0:
             result[k] = 1.0 - np.var(returns - values) / returns.var()
     return result
-
-
-def _empty_net(n_networks: int, inputs: int, width: int) -> nn.Sequential:
-    def linear(n_in: int, n_out: int) -> StackedLinear:
-        return StackedLinear(th.zeros(n_networks, n_out, n_in), th.zeros(n_networks, n_out))
-
-    return nn.Sequential(linear(inputs, width), nn.ReLU(), linear(width, width), nn.ReLU(), linear(width, 1))
-
-
-def _initialize(net: nn.Sequential, index: int, rng: np.random.Generator) -> None:
-    """PyTorch's default initialisation of linear layers for one network of the stack, from that client's stream."""
-    with th.no_grad():
-        for layer in net:
-            if isinstance(layer, StackedLinear):
-                bound = 1.0 / np.sqrt(layer.weight.shape[2])
-                for parameter in (layer.weight, layer.bias):
-                    parameter[index] = th.from_numpy(rng.uniform(-bound, bound, tuple(parameter.shape[1:]))).float()
 
 
 def _check(

@@ -41,6 +41,7 @@ def write_minari(
                 truncations=truncations,
             )
         )
+    folder.mkdir(parents=True, exist_ok=True)
     storage = MinariStorage.new(folder / "data", _as_float32(observation_space), _as_float32(action_space), data_format="hdf5")
     storage.update_metadata({"dataset_id": dataset_id, "minari_version": minari.__version__, **metadata})
     storage.update_episodes(episodes)

@@ -9,22 +9,21 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from pydantic import BaseModel, ConfigDict, Field
 from torch import nn
 
 from fed_envs import Family, load_family
 from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.behavior_cloning import clone
 from sb3_fedguide.offline.cache import arrays_hash, cache_folder, cached_arrays, content_key, write_arrays
+from sb3_fedguide.offline.config import Piece, PretrainingConfig
 from sb3_fedguide.offline.datasets import OfflineData, client_datasets, normalize_observations
 from sb3_fedguide.offline.dice import DiceValue, train_dice
 from sb3_fedguide.offline.progress import Progress, TqdmProgress, stage_progress
@@ -36,64 +35,6 @@ VERSION = 1
 """Raised whenever the same inputs give other results, so that old cache entries are not taken for new ones."""
 
 Arrays = dict[str, np.ndarray]
-Count = Annotated[int, Field(ge=1)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-
-
-class PretrainingConfig(BaseModel):
-    """Settings of the offline stage.
-
-    Lengths are in updates. ``*_epochs`` lengthens a piece to so many passes over the data; the updates are then a floor
-    (40 epochs of 5,000 rows are only 400 updates and leave a network untrained).
-
-    :param dataset: a Minari dataset (id or path, ``{client}`` stands for the client's number) instead of one made on the spot
-    :param dataset_size: rows per client; default 20,000, or 1,000 for Bandit2D; a given dataset is used whole
-    :param gamma: discount factor of the DICE value
-    :param prior: ``"gaussian"`` (state-independent), ``"diffusion"``, or ``"auto"``: Gaussian for Bandit2D
-    :param prior_average_every: updates between two averages of the trunk over the clients
-    :param dice_v_coef: coefficient of V in its loss: a number, or ``"1-gamma"`` as printed in the paper
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    dataset: str | None = None
-    dataset_size: Count | None = None
-    gamma: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.99
-
-    bc_updates: Count = 2000
-    bc_epochs: Count | None = None
-    bc_batch_size: Count = 512
-    bc_learning_rate: Positive = 3e-4
-
-    prior: Literal["auto", "gaussian", "diffusion"] = "auto"
-    prior_updates: Count = 5000
-    prior_epochs: Count | None = None
-    prior_batch_size: Count = 256
-    prior_learning_rate: Positive = 1e-3
-    prior_width: Count = 64
-    prior_average_every: Count = 50
-
-    dice_updates: Count = 5000
-    dice_epochs: Count | None = None
-    dice_batch_size: Count = 128
-    dice_learning_rate: Positive = 1e-4
-    dice_width: Count = 256
-    dice_omega: Positive = 0.5
-    dice_f: Literal["soft_chi", "kl", "chi2"] = "soft_chi"
-    dice_v_coef: float | Literal["1-gamma"] = 1.0
-
-    def n_updates(self, piece: Literal["bc", "prior", "dice"], n_rows: int) -> int:
-        """Updates of a piece on ``n_rows`` rows: its floor, or its epochs if these are more."""
-        floor, epochs = getattr(self, f"{piece}_updates"), getattr(self, f"{piece}_epochs")
-        return max(floor, (epochs or 0) * math.ceil(n_rows / getattr(self, f"{piece}_batch_size")))
-
-    def settings(self, *pieces: str) -> dict[str, Any]:
-        """The fields that begin with one of ``pieces``, for a cache key; lengths are not among them."""
-        return {
-            name: value
-            for name, value in self.model_dump(mode="json").items()
-            if name.split("_")[0] in pieces and not name.endswith(("_updates", "_epochs"))
-        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -322,7 +263,7 @@ class Pretraining:
         prior.load_state_dict({name.removeprefix("state/"): tensor for name, tensor in state.items()})
         return prior.requires_grad_(False), int(arrays["bytes_up"]), int(arrays["bytes_down"])
 
-    def _client_key(self, index: int, piece: Literal["bc", "prior", "dice"], **more: Any) -> str:
+    def _client_key(self, index: int, piece: Piece, **more: Any) -> str:
         """Cache key of one client's part of a piece: its own data, settings and stream, and nothing of other clients."""
         client = self.client_ids[index]
         data = self._data[client]
@@ -331,9 +272,7 @@ class Pretraining:
             n_updates=self.config.n_updates(piece, len(data)), **self.config.settings(piece), **more,
         )  # fmt: skip
 
-    def _per_client(
-        self, piece: Literal["bc", "prior", "dice"], keys: Sequence[str], train: Callable[[list[int], int], list[Arrays]]
-    ) -> list[Arrays]:
+    def _per_client(self, piece: Piece, keys: Sequence[str], train: Callable[[list[int], int], list[Arrays]]) -> list[Arrays]:
         """Every client's entry; those that are not cached are trained together, and each is stored by itself."""
         paths = [self.cache / "pretraining" / piece / f"{key}.npz" for key in keys]
         entries: list[Arrays | None] = [cached_arrays(path) for path in paths]

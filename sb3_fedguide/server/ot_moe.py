@@ -40,7 +40,7 @@ def sinkhorn_plan(
     mu = np.full(n, 1 / n) if row_marginal is None else np.asarray(row_marginal, dtype=np.float64)
     nu = np.full(m, 1 / m) if column_marginal is None else np.asarray(column_marginal, dtype=np.float64)
     plan, _ = ot.sinkhorn(
-        mu, nu, cost, reg=eta, method="sinkhorn_log", numItermax=10_000, stopThr=1e-9, log=True, warn=False
+        mu, nu, cost, reg=eta, method="sinkhorn_log", numItermax=10_000, stopThr=min(1e-7, 1e-5 / n), log=True, warn=False
     )
     error = float(max(np.abs(plan.sum(1) - mu).max(), np.abs(plan.sum(0) - nu).max()))
     if not error <= 1e-4 / n:

@@ -1,0 +1,88 @@
+"""The flags of ``train.py``: those of rl-baselines3-zoo, and a few of a federation's own. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from sb3_fedguide.algorithms import ALGORITHMS
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Errors are one message on one line, with exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def train_parser(prog: str) -> OneLineParser:
+    """Parser of the training command."""
+    parser = OneLineParser(
+        prog=prog,
+        allow_abbrev=False,
+        description="Train a federation: every client of a family of environments, on this machine.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    flag = parser.add_argument
+    flag("--algo", default="fedguide", metavar="ALGO", help=", ".join(ALGORITHMS))
+    flag("--env", metavar="FAMILY", help="family of client environments, e.g. HopperHard")
+    flag("--metadata", metavar="FILE", help="metadata file of a family of your own (python -m fed_envs.metadata generate)")
+    flag("--dataset", metavar="ID", help="Minari dataset, id or path, instead of data made on the spot; '{client}' in it "
+         "stands for the client's number")  # fmt: skip
+    flag("-n", "--n-timesteps", type=int, metavar="N", help="environment steps of all clients together, instead of --rounds")
+    flag("--rounds", type=int, metavar="N", help="communication rounds; by default those of the configuration")
+    flag("--n-envs-per-client", type=int, metavar="N", help="environments per client; by default those of the configuration")
+    flag("-conf", "--conf-file", default="tuned", metavar="CONF", help="hyperparameters: tuned, paper, or a YAML file")
+    flag("-params", "--hyperparams", nargs="+", action="extend", default=[], metavar="KEY:VALUE",
+         help="hyperparameters to overwrite, e.g. learning_rate:1e-4 policy_kwargs.net_arch:[64,64] "
+         "pretraining.dice_updates:1000")  # fmt: skip
+    flag("--seed", type=int, default=0, help="of the whole federation; negative: drawn at random")
+    flag("-f", "--log-folder", default="logs", metavar="DIR", help="runs are written to DIR/ALGO/FAMILY_<number>")
+    flag("-tb", "--tensorboard-log", metavar="DIR", help="TensorBoard events to DIR/FAMILY/ALGO_<number>; by default to tb "
+         "in the run's folder")  # fmt: skip
+    flag("--cache-dir", metavar="DIR", help="where results of the offline stage are kept; by default $FEDGUIDE_CACHE or "
+         "~/.cache/fedguide")  # fmt: skip
+    flag("--eval-freq", type=int, default=5, metavar="ROUNDS", help="rounds between evaluations; the last twenty are all "
+         "evaluated")  # fmt: skip
+    flag("--eval-episodes", type=int, default=10, metavar="N", help="evaluation episodes per client")
+    flag("--no-eval", action="store_true", help="do not evaluate")
+    flag("-P", "--progress", action="store_true", help="progress bars")
+    flag("--device", default="cpu", help="PyTorch device, e.g. cpu or cuda")
+    flag("--num-threads", type=int, default=1, metavar="N", help="threads of PyTorch; small networks gain nothing from more")
+    flag("--verbose", type=int, default=1, choices=(0, 1, 2), help="0: nothing but errors; 1: the log of each round (not "
+         "beside progress bars); 2: always")  # fmt: skip
+    return parser
+
+
+def parse_train(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
+    """Parse, and refuse what the flags alone show to be wrong."""
+    parser = train_parser(prog)
+    arguments, unknown = parser.parse_known_args(argv)
+    if unknown:
+        flags = [option for action in parser._actions for option in action.option_strings]
+        parser.error(_unknown(unknown[0], flags))
+    for problem in _problems(arguments):
+        parser.error(problem)
+    return arguments
+
+
+def _unknown(argument: str, flags: Sequence[str]) -> str:
+    from sb3_fedguide.cli.names import nearest
+
+    return f"unknown argument {argument!r}.{nearest(argument.split('=')[0], flags)}"
+
+
+def _problems(arguments: Any) -> list[str]:
+    found = []
+    if arguments.env is None and arguments.metadata is None:
+        found.append("give the clients' environments with --env FAMILY, or --metadata FILE")
+    if arguments.n_timesteps is not None and arguments.rounds is not None:
+        found.append("-n/--n-timesteps and --rounds both say how long to train; give one of them")
+    for name in ("n_timesteps", "rounds", "n_envs_per_client", "eval_freq", "eval_episodes", "num_threads"):
+        value = getattr(arguments, name)
+        if value is not None and value < 1:
+            found.append(f"--{name.replace('_', '-')} must be at least 1, not {value}")
+    if arguments.seed >= 2**31:
+        found.append(f"--seed must be below 2^31, not {arguments.seed}")
+    return found

@@ -1,0 +1,248 @@
+"""The one resolver of hyperparameters: a file of ``zoo_configs``, then ``-params``, then flags, all checked."""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from sb3_fedguide.algorithms import ALGORITHMS, algorithm
+from sb3_fedguide.cli import schema
+from sb3_fedguide.cli.names import check_names, nearest
+
+if TYPE_CHECKING:
+    from fed_envs import Family
+    from sb3_fedguide.common.federated_ppo import FederatedPPO
+
+#: Name of a configuration to the folder inside ``zoo_configs`` that holds it.
+CONFIGURATIONS = {"tuned": ".", "paper": "paper"}
+
+#: Families whose settings a user's own family on the same backbone starts from.
+BACKBONE_FAMILIES = {
+    "Bandit2D": "Bandit2D", "Reacher-v5": "Reacher", "Hopper-v5": "Hopper", "Walker2d-v5": "Walker2D",
+    "HalfCheetah-v5": "HalfCheetah",
+}  # fmt: skip
+
+DEFAULT = "default"
+NESTED = ("pretraining", "policy_kwargs")
+_SET_ELSEWHERE = {"gamma": "the DICE value takes the algorithm's own gamma"}
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.2's numbers: ``3e-4`` is one, as in JSON; duplicate keys are refused."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.value != "<<"]
+        for name in names:
+            if names.count(name) > 1:
+                raise yaml.YAMLError(f"the key {name!r} stands twice in one mapping, line {node.start_mark.line + 1}")
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"),
+    list("-+0123456789."),
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Hyperparameters of one run, complete and checked.
+
+    :param algo: command-line name of the algorithm
+    :param entry: the entry of the configuration file that applied beyond ``default``
+    :param values: every hyperparameter as plain data, ``n_rounds`` included
+    """
+
+    algo: str
+    entry: str
+    values: dict[str, Any]
+
+    @property
+    def n_rounds(self) -> int:
+        return self.values["n_rounds"]
+
+    def make(self, env: Any, **arguments: Any) -> FederatedPPO:
+        """Construct the algorithm.
+
+        :param env: whatever a federation can be made of
+        :param arguments: constructor arguments that are no hyperparameters, such as ``seed``
+        :raises ValueError: where the values do not fit together
+        """
+        values = {name: schema.schedule_or_value(value) for name, value in self.values.items() if name != "n_rounds"}
+        network = schema.NetworkConfig.model_validate(values.pop("policy_kwargs"))
+        policy = values.pop("policy")
+        with warnings.catch_warnings():
+            # SB3 compares a client's batch_size with the steps of all clients; FederatedPPO has checked it against its own.
+            warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
+            return algorithm(self.algo)(policy, env, policy_kwargs=network.to_kwargs(), **values, **arguments)
+
+
+def resolve(
+    algo: str,
+    family: Family,
+    conf_file: str = "tuned",
+    entry: str | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    n_timesteps: int | None = None,
+) -> Config:
+    """The hyperparameters of a run.
+
+    :param algo: command-line name of an algorithm
+    :param family: whom to train
+    :param conf_file: ``"tuned"``, ``"paper"``, or the path of a YAML file
+    :param entry: name of the family whose settings to take; by default the family's own, or that of its backbone
+    :param overrides: from ``-params`` and flags; nested ones by dotted keys
+    :param n_timesteps: steps of all clients together instead of ``n_rounds``
+    :raises ValueError: for anything unknown, of the wrong type or out of range
+    """
+    check_names([algo], ALGORITHMS, "algorithm")
+    path = config_path(conf_file, algo)
+    content = read_config(path)
+    applied = next(
+        (name for name in (entry or family.name, BACKBONE_FAMILIES.get(family.backbone, "")) if name in content), DEFAULT
+    )
+    merged: dict[str, Any] = {}
+    for name in dict.fromkeys((DEFAULT, applied)):
+        if name in content:
+            _check_keys(content[name], algo, f"{path}, entry {name!r}")
+            merged = _merge(merged, content[name])
+    merged = _merge(merged, _nest(overrides or {}))
+    try:
+        values = complete(merged, algo)
+    except ValueError as error:
+        raise ValueError(f"{error} ({_origin(path, applied)})") from None
+    if n_timesteps is not None:
+        if n_timesteps < 1:
+            raise ValueError(f"n_timesteps={n_timesteps} must be at least 1; it counts the steps of all clients together")
+        values["n_rounds"] = math.ceil(n_timesteps / (values["rollout_size"] * family.n_clients))
+    return Config(algo, applied, values)
+
+
+def complete(given: Mapping[str, Any], algo: str) -> dict[str, Any]:
+    """Check plain values and fill in the defaults of the constructors.
+
+    :raises ValueError: for the first value that is wrong
+    """
+    from sb3_fedguide.offline.pretraining import PretrainingConfig
+
+    parameters = schema.hyperparameters(algorithm(algo))
+    _check_keys(given, algo, "the hyperparameters")
+    if "n_rounds" not in given:
+        raise ValueError("the number of rounds is missing; give n_rounds in the configuration, or --rounds")
+    values: dict[str, Any] = {
+        "policy": schema.check_value("policy", given.get("policy", "MlpPolicy"), _policy_type(algo)),
+        "n_rounds": schema.check_value("n_rounds", given["n_rounds"], int),
+    }
+    for name, (hint, default) in parameters.items():
+        if name not in NESTED:
+            values[name] = schema.check_value(name, given[name], hint) if name in given else default
+    network = schema.check_model("policy_kwargs", schema.NetworkConfig, given.get("policy_kwargs") or {}, {})
+    offline = schema.check_model("pretraining", PretrainingConfig, given.get("pretraining") or {}, _SET_ELSEWHERE)
+    values["policy_kwargs"] = network.model_dump(mode="json")
+    values["pretraining"] = offline.model_dump(mode="json", exclude=set(_SET_ELSEWHERE))
+    return values
+
+
+def config_path(conf_file: str, algo: str) -> Path:
+    """The YAML file of a configuration, by name or path.
+
+    :raises ValueError: if there is none
+    """
+    if conf_file in CONFIGURATIONS:
+        import zoo_configs
+
+        folder = Path(next(iter(zoo_configs.__path__)))
+        return folder / CONFIGURATIONS[conf_file] / f"{algo}.yml"
+    path = Path(conf_file)
+    if not path.is_file():
+        hint = "" if path.suffix else nearest(conf_file, CONFIGURATIONS)
+        raise ValueError(f"no configuration {conf_file!r}.{hint} Give {' or '.join(CONFIGURATIONS)}, or the path of a YAML file")
+    return path
+
+
+def read_config(path: Path) -> dict[str, dict[str, Any]]:
+    """A configuration file: a mapping of families (and ``default``) to hyperparameters.
+
+    :raises ValueError: if it cannot be read or is something else
+    """
+    try:
+        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # a SafeLoader
+    except OSError as error:
+        raise ValueError(f"cannot read the configuration {path}: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(content, dict) or not all(isinstance(entry, dict) for entry in content.values()):
+        raise ValueError(
+            f"{path}: a configuration maps families (or {DEFAULT!r}) to their hyperparameters, e.g. 'HopperHard: {{n_rounds: 100}}'"
+        )
+    return content
+
+
+def parse_params(pairs: Sequence[str]) -> dict[str, Any]:
+    """``key:value`` pairs of ``-params``; values are YAML scalars or lists, and nothing is evaluated.
+
+    :raises ValueError: for a pair without a key or value, a key that is given twice, or a value that is no YAML
+    """
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        key, colon, text = pair.partition(":")
+        if not colon or not key or not text:
+            raise ValueError(f"-params takes key:value pairs such as learning_rate:3e-4, but got {pair!r}")
+        if key in values:
+            raise ValueError(f"-params gives {key!r} twice")
+        try:
+            values[key] = yaml.load(text, _Loader)  # a SafeLoader
+        except yaml.YAMLError:
+            raise ValueError(f"-params {key}: {text!r} is not a number, text or [list]") from None
+    return values
+
+
+def _policy_type(algo: str) -> Any:
+    from typing import Literal
+
+    return Literal[tuple(algorithm(algo).policy_aliases)]
+
+
+def _check_keys(values: Mapping[str, Any], algo: str, where: str) -> None:
+    known = {"policy", "n_rounds", *schema.hyperparameters(algorithm(algo))}
+    for name in values:
+        if not isinstance(name, str) or name not in known:
+            raise ValueError(
+                f"unknown hyperparameter {name!r} of {algo} in {where}.{nearest(name, known)} "
+                f"Known: {', '.join(sorted(known))}"
+            )
+
+
+def _nest(dotted: Mapping[str, Any]) -> dict[str, Any]:
+    """``{"a.b": 1}`` as ``{"a": {"b": 1}}``."""
+    nested: dict[str, Any] = {}
+    for key, value in dotted.items():
+        head, dot, tail = key.partition(".")
+        if dot and head not in NESTED:
+            raise ValueError(f"{key!r}: only {' and '.join(NESTED)} have parts.{nearest(head, NESTED)}")
+        nested = _merge(nested, {head: {tail: value}} if dot else {key: value})
+    return nested
+
+
+def _merge(base: Mapping[str, Any], update: Mapping[str, Any]) -> dict[str, Any]:
+    """``update`` over ``base``; the nested mappings are merged key by key."""
+    merged = copy.deepcopy(dict(base))
+    for key, value in update.items():
+        if key in NESTED and isinstance(value, Mapping) and isinstance(merged.get(key), Mapping):
+            merged[key] = {**merged[key], **value}
+        else:
+            merged[key] = copy.deepcopy(value)
+    return merged
+
+
+def _origin(path: Path, entry: str) -> str:
+    return f"settings: {path.name}, {entry}, and the command line"

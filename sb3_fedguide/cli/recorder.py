@@ -1,0 +1,59 @@
+"""Callbacks of a run on the command line: what it cost, and the course of its evaluations."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback
+from sb3_fedguide.common.evaluation import Evaluation, FederatedEvalCallback
+
+TIMES = ("rollout", "train", "exchange")
+
+
+class CostCallback(RoundCallback):
+    """Adds up seconds by part of a round and the bytes that the exchange carried."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seconds = dict.fromkeys(TIMES, 0.0)
+        self.round_seconds: list[float] = []
+        self._exchange: ExchangeCallback | None = None
+
+    @property
+    def bytes_up(self) -> int:
+        """Uploaded by all clients together."""
+        return 0 if self._exchange is None else self._exchange.bytes_up
+
+    @property
+    def bytes_down(self) -> int:
+        """Sent to all clients together."""
+        return 0 if self._exchange is None else self._exchange.bytes_down
+
+    def _on_training_start(self) -> None:
+        self._exchange = next((hook for hook in self.locals["rounds"] if isinstance(hook, ExchangeCallback)), None)
+        self._started = time.perf_counter()
+
+    def _on_round_end(self) -> None:
+        for name in TIMES:
+            self.seconds[name] += float(self.logger.name_to_value.get(f"time/{name}", 0.0))
+        now = time.perf_counter()
+        self.round_seconds.append(now - self._started)
+        self._started = now
+
+
+class RunEvalCallback(FederatedEvalCallback):
+    """Keeps the average return of every evaluation, and the seconds they took."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.seconds = 0.0
+        #: policy to ``[round, client-average return]`` of each evaluation
+        self.curves: dict[str, list[tuple[int, float]]] = {}
+
+    def _evaluate(self, policy: str, round: int) -> Evaluation:
+        started = time.perf_counter()
+        evaluation = super()._evaluate(policy, round)
+        self.seconds += time.perf_counter() - started
+        self.curves.setdefault(policy, []).append((round, evaluation.average))
+        return evaluation

@@ -1,0 +1,93 @@
+"""What a run ends with: ``summary.json`` and a table on the terminal."""
+
+from __future__ import annotations
+
+import statistics
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from sb3_fedguide.cli.recorder import CostCallback, RunEvalCallback
+    from sb3_fedguide.common.federated_ppo import FederatedPPO
+
+
+def summarize(
+    model: FederatedPPO,
+    costs: CostCallback,
+    evaluation: RunEvalCallback | None,
+    pretraining_seconds: float,
+    total_seconds: float,
+    **identity: Any,
+) -> dict[str, Any]:
+    """One run in a page of plain data: who, how long, how good, and how much was communicated.
+
+    :param identity: what else identifies the run, such as its algorithm
+    """
+    evaluated = evaluation.last if evaluation is not None else {}
+    result: dict[str, Any] = {
+        **identity,
+        "seed": model.seed,
+        "n_clients": model.n_clients,
+        "clients": model.client_ids,
+        "rounds_done": model.round,
+        "finished": model.round >= identity["n_rounds"],
+        "timesteps": model.num_timesteps,
+        "bytes_up": costs.bytes_up,
+        "bytes_down": costs.bytes_down,
+        "seconds": {
+            "total": total_seconds,
+            "pretraining": pretraining_seconds,
+            **costs.seconds,
+            "evaluation": evaluation.seconds if evaluation is not None else 0.0,
+            "median_round": statistics.median(costs.round_seconds) if costs.round_seconds else None,
+        },
+    }
+    for policy in evaluated:
+        result[policy] = {
+            "client_returns": [float(value) for value in evaluated[policy].client_returns],
+            "client_lengths": [float(value) for value in evaluated[policy].lengths.mean(axis=1)],
+            "average": evaluated[policy].average,
+            "worst_client": evaluated[policy].worst_client,
+            "n_episodes": int(evaluated[policy].returns.shape[1]),
+            "curve": [list(point) for point in evaluation.curves[policy]] if evaluation is not None else [],
+        }
+    return result
+
+
+def print_summary(summary: dict[str, Any], folder: str) -> None:
+    """The table at the end of a run."""
+    console = Console(width=None if Console().is_terminal else 100)
+    policies = [policy for policy in ("deployed", "broadcast") if policy in summary]
+    rounds = f"{summary['rounds_done']} of {summary['n_rounds']} rounds"
+    table = Table(title=f"{summary['algo']} on {summary['env']}, seed {summary['seed']}, {rounds}", title_justify="left")
+    table.add_column("client", justify="right")
+    for policy in policies:
+        table.add_column(f"{policy} return", justify="right")
+    table.add_column("episode length", justify="right")
+    for index, client in enumerate(summary["clients"] if policies else []):
+        values = [f"{summary[policy]['client_returns'][index]:.2f}" for policy in policies]
+        table.add_row(str(client), *values, f"{summary[policies[0]]['client_lengths'][index]:.0f}")
+    if policies:
+        table.add_section()
+        table.add_row("[bold]average", *[f"[bold]{summary[policy]['average']:.2f}" for policy in policies], "")
+        table.add_row("worst", *[f"{summary[policy]['worst_client']:.2f}" for policy in policies], "")
+        console.print(table)
+    else:
+        console.print(f"{table.title}; no evaluation")
+    seconds = summary["seconds"]
+    parts = ", ".join(
+        f"{part} {seconds[part]:.0f} s" for part in ("pretraining", "rollout", "train", "exchange", "evaluation")
+    )
+    console.print(f"time   {seconds['total']:.0f} s ({parts})", highlight=False)
+    console.print(f"bytes  {_size(summary['bytes_up'])} up, {_size(summary['bytes_down'])} down", highlight=False)
+    console.print(f"folder {folder}", highlight=False, soft_wrap=True)
+
+
+def _size(n_bytes: float) -> str:
+    for unit in ("B", "kB", "MB"):
+        if n_bytes < 1000:
+            return f"{n_bytes:.0f} {unit}" if unit == "B" else f"{n_bytes:.1f} {unit}"
+        n_bytes /= 1000
+    return f"{n_bytes:.2f} GB"

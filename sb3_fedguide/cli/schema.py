@@ -1,0 +1,195 @@
+"""What the hyperparameters of an algorithm are, read off its constructors, and the check of plain values against them."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+import types
+import typing
+from collections.abc import Callable, Mapping
+from typing import Any, Literal
+
+import pydantic
+
+from sb3_fedguide.cli.names import check_names
+
+#: Constructor parameters that have a flag of their own or no meaning on the command line.
+NOT_HYPERPARAMETERS = {
+    "self", "policy", "env", "clients", "cache_dir", "tensorboard_log", "verbose", "seed", "device", "_init_setup_model",
+}  # fmt: skip
+
+#: A value that falls linearly to zero over the run, as in rl-baselines3-zoo.
+SCHEDULE = re.compile(r"^lin_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)?)$")
+
+_OPEN = 1e-12  # smallest value of what must be positive
+
+#: Closed ranges of what no constructor checks.
+RANGES: dict[str, tuple[float, float]] = {
+    "n_rounds": (1, math.inf),
+    "learning_rate": (_OPEN, math.inf),
+    "n_epochs": (1, math.inf),
+    "gamma": (0, 1),
+    "gae_lambda": (0, 1),
+    "clip_range": (_OPEN, math.inf),
+    "clip_range_vf": (_OPEN, math.inf),
+    "ent_coef": (0, math.inf),
+    "vf_coef": (0, math.inf),
+    "max_grad_norm": (_OPEN, math.inf),
+    "n_envs_per_client": (1, math.inf),
+    "rollout_size": (2, math.inf),
+    "stats_window_size": (1, math.inf),
+    "bc_weight": (0, 1),
+    "beta": (0, 1),
+    "n_experts": (1, math.inf),
+    "eta": (_OPEN, math.inf),
+    "prior_states": (1, math.inf),
+    "density_steps": (1, math.inf),
+    "sampling_steps": (1, math.inf),
+    "adapt_temperature": (_OPEN, math.inf),
+    "adapt_weight": (0, 1),
+    "average_until": (1, math.inf),
+}
+
+ACTIVATIONS = {"tanh": "Tanh", "relu": "ReLU", "elu": "ELU", "leaky_relu": "LeakyReLU", "silu": "SiLU"}
+
+
+class NetworkConfig(pydantic.BaseModel):
+    """``policy_kwargs`` as plain data.
+
+    :param net_arch: hidden layers of actor and critic, ``[64, 64]`` or ``{pi: [64, 64], vf: [64, 64]}``
+    :param activation_fn: by name
+    :param log_std_init: initial log standard deviation
+    :param ortho_init: orthogonal initialisation
+    """
+
+    model_config = pydantic.ConfigDict(extra="forbid", strict=True)
+
+    net_arch: list[pydantic.PositiveInt] | dict[Literal["pi", "vf"], list[pydantic.PositiveInt]] | None = None
+    activation_fn: Literal["tanh", "relu", "elu", "leaky_relu", "silu"] = "tanh"
+    log_std_init: pydantic.FiniteFloat = 0.0
+    ortho_init: bool = True
+
+    @pydantic.field_validator("net_arch", mode="after")
+    @classmethod
+    def _both_networks(cls, value: Any) -> Any:
+        if isinstance(value, dict) and set(value) != {"pi", "vf"}:
+            raise ValueError("needs both pi and vf")
+        return value
+
+    def to_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of SB3's policy."""
+        from torch import nn
+
+        kwargs = self.model_dump(exclude_none=True)
+        kwargs["activation_fn"] = getattr(nn, ACTIVATIONS[self.activation_fn])
+        return kwargs
+
+
+def hyperparameters(algorithm: type) -> dict[str, tuple[Any, Any]]:
+    """Name to (type, default) of every hyperparameter of an algorithm, its own first, then those of its bases."""
+    found: dict[str, tuple[Any, Any]] = {}
+    for cls in algorithm.__mro__:
+        if "__init__" not in cls.__dict__:
+            continue
+        constructor: Callable[..., None] = cls.__dict__["__init__"]
+        hints = typing.get_type_hints(constructor)
+        signature = inspect.signature(constructor).parameters.values()
+        for parameter in signature:
+            if parameter.name not in NOT_HYPERPARAMETERS and parameter.kind is not parameter.VAR_KEYWORD:
+                found.setdefault(parameter.name, (hints.get(parameter.name, Any), parameter.default))
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature):
+            break  # the first constructor that hands nothing on states every remaining parameter
+    return found
+
+
+def check_value(name: str, value: Any, hint: Any) -> Any:
+    """One hyperparameter as plain data: numbers, strings, lists; a schedule is a string such as ``lin_3e-4``.
+
+    :raises ValueError: for a value of another type or out of range
+    """
+    options = _options(hint)
+    schedule = _takes_schedule(options)
+    options = [option for option in options if not _is_callable_type(option)]
+    number = value
+    if schedule and isinstance(value, str) and (match := SCHEDULE.match(value)):
+        number = float(match["value"])
+    else:
+        try:
+            value = number = pydantic.TypeAdapter(typing.Union[tuple(options)]).validate_python(value, strict=True)
+        except pydantic.ValidationError:
+            expected = " or ".join([_describe(option) for option in options] + ["a schedule such as lin_3e-4"] * schedule)
+            raise ValueError(f"{name} must be {expected}, but it is {_show(value)}") from None
+    if isinstance(number, float | int) and not isinstance(number, bool):
+        _check_range(name, number)
+    return value
+
+
+def check_model(name: str, model: type[pydantic.BaseModel], value: Any, excluded: Mapping[str, str]) -> pydantic.BaseModel:
+    """A nested mapping against its model.
+
+    :param excluded: fields that are not to be set here, with what to do instead
+    :raises ValueError: one line that names the field
+    """
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name} must be a mapping of {', '.join(model.model_fields)}, but it is {_show(value)}")
+    for field, instead in excluded.items():
+        if field in value:
+            raise ValueError(f"{name}.{field} cannot be set here: {instead}")
+    check_names((str(key) for key in value), model.model_fields, f"key in {name}:")
+    for field, given in value.items():
+        try:
+            model.model_validate({field: given}, strict=True)
+        except pydantic.ValidationError as error:
+            reasons = dict.fromkeys(_reason(problem) for problem in error.errors(include_url=False))
+            raise ValueError(f"{name}.{field}: {' or '.join(reasons)} (it is {_show(given)})") from None
+    return model.model_validate(dict(value))
+
+
+def schedule_or_value(value: Any) -> Any:
+    """SB3's schedule for a string such as ``lin_3e-4``; anything else as it is."""
+    if isinstance(value, str) and (match := SCHEDULE.match(value)):
+        from stable_baselines3.common.utils import LinearSchedule
+
+        return LinearSchedule(float(match["value"]), 0.0, 1.0)
+    return value
+
+
+def _check_range(name: str, number: float) -> None:
+    if not math.isfinite(number):
+        raise ValueError(f"{name}={number} must be finite")
+    low, high = RANGES.get(name, (-math.inf, math.inf))
+    if not low <= number <= high:
+        lower = "positive" if low == _OPEN else f"at least {low:g}"
+        expected = lower if high == math.inf else f"between {low:g} and {high:g}"
+        raise ValueError(f"{name}={number} must be {expected}")
+
+
+def _reason(problem: Any) -> str:
+    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
+    return message[0].lower() + message[1:]
+
+
+def _options(hint: Any) -> list[Any]:
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return [option for part in typing.get_args(hint) for option in _options(part)]
+    return [hint]
+
+
+def _is_callable_type(hint: Any) -> bool:
+    return typing.get_origin(hint) is Callable or hint is Callable
+
+
+def _takes_schedule(options: list[Any]) -> bool:
+    return any(_is_callable_type(option) for option in options)
+
+
+def _describe(hint: Any) -> str:
+    if typing.get_origin(hint) is Literal:
+        return " or ".join(repr(choice) for choice in typing.get_args(hint))
+    names = {int: "an integer", float: "a number", bool: "true or false", str: "a string", type(None): "null"}
+    return names.get(hint, str(hint))
+
+
+def _show(value: Any) -> str:
+    return f"the text {value!r}" if isinstance(value, str) else f"{value!r}"

@@ -1,0 +1,70 @@
+"""Settings of the offline stage."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["Piece", "PretrainingConfig"]
+
+Count = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Piece = Literal["bc", "prior", "dice"]
+
+
+class PretrainingConfig(BaseModel):
+    """Settings of the offline stage; :class:`sb3_fedguide.offline.pretraining.Pretraining` takes them.
+
+    Lengths are in updates. ``*_epochs`` lengthens a piece to so many passes over the data; the updates are then a floor
+    (40 epochs of 5,000 rows are only 400 updates and leave a network untrained).
+
+    :param dataset: a Minari dataset (id or path, ``{client}`` stands for the client's number) instead of one made on the spot
+    :param dataset_size: rows per client; default 20,000, or 1,000 for Bandit2D; a given dataset is used whole
+    :param gamma: discount factor of the DICE value
+    :param prior: ``"gaussian"`` (state-independent), ``"diffusion"``, or ``"auto"``: Gaussian for Bandit2D
+    :param prior_average_every: updates between two averages of the trunk over the clients
+    :param dice_v_coef: coefficient of V in its loss: a number, or ``"1-gamma"`` as printed in the paper
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    dataset: str | None = None
+    dataset_size: Count | None = None
+    gamma: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.99
+
+    bc_updates: Count = 2000
+    bc_epochs: Count | None = None
+    bc_batch_size: Count = 512
+    bc_learning_rate: Positive = 3e-4
+
+    prior: Literal["auto", "gaussian", "diffusion"] = "auto"
+    prior_updates: Count = 5000
+    prior_epochs: Count | None = None
+    prior_batch_size: Count = 256
+    prior_learning_rate: Positive = 1e-3
+    prior_width: Count = 64
+    prior_average_every: Count = 50
+
+    dice_updates: Count = 5000
+    dice_epochs: Count | None = None
+    dice_batch_size: Count = 128
+    dice_learning_rate: Positive = 1e-4
+    dice_width: Count = 256
+    dice_omega: Positive = 0.5
+    dice_f: Literal["soft_chi", "kl", "chi2"] = "soft_chi"
+    dice_v_coef: float | Literal["1-gamma"] = 1.0
+
+    def n_updates(self, piece: Piece, n_rows: int) -> int:
+        """Updates of a piece on ``n_rows`` rows: its floor, or its epochs if these are more."""
+        floor, epochs = getattr(self, f"{piece}_updates"), getattr(self, f"{piece}_epochs")
+        return max(floor, (epochs or 0) * math.ceil(n_rows / getattr(self, f"{piece}_batch_size")))
+
+    def settings(self, *pieces: str) -> dict[str, Any]:
+        """The fields that begin with one of ``pieces``, for a cache key; lengths are not among them."""
+        return {
+            name: value
+            for name, value in self.model_dump(mode="json").items()
+            if name.split("_")[0] in pieces and not name.endswith(("_updates", "_epochs"))
+        }
