@@ -1,0 +1,46 @@
+"""The console script ``fedguide``: its subcommands. Each imports what it needs when it is called."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+
+from sb3_fedguide.cli.names import nearest
+
+USAGE = """usage: fedguide COMMAND ...
+
+  train    train a federation (the same as train.py)
+  demo     FedAvg beside FedGuide on Bandit2D, with a picture
+
+fedguide COMMAND --help shows a command's flags"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a subcommand and return its exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        from sb3_fedguide import __version__
+
+        print(__version__)
+        return 0
+    commands: dict[str, Callable[[Sequence[str]], int]] = {"train": _train, "demo": _demo}
+    if arguments[0] not in commands:
+        print(f"fedguide: error: unknown command {arguments[0]!r}.{nearest(arguments[0], commands)} Known: "
+              f"{', '.join(commands)}", file=sys.stderr)  # fmt: skip
+        return 2
+    return commands[arguments[0]](arguments[1:])
+
+
+def _train(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.train import main
+
+    return main(argv, prog="fedguide train")
+
+
+def _demo(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.demo import main
+
+    return main(argv)
