@@ -34,7 +34,7 @@ class Policies:
         return np.exp(-0.5 * (z**2).sum(-1)) / (2 * np.pi * self.std.prod(-1))[:, None]
 
     def expected_reward(self, n: int = 401) -> np.ndarray:
-        """``E_pi[r]`` of every client, ``(n_clients,)``, by summation over a grid; actions are clipped as in the environment."""
+        """``E_pi[r]`` of every client, ``(n_clients,)``, summed over a grid; actions are clipped as in the environment."""
         limit = ACTION_LIMIT + 5 * float(self.std.max())
         axis = np.linspace(-limit, limit, n)
         points = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
@@ -55,7 +55,8 @@ def policies(model: FederatedPPO) -> Policies:
     zeros = np.zeros((model.n_clients, 1, model.observation_space.shape[0]), dtype=np.float32)  # type: ignore[index]
     with th.no_grad():
         mean = model.policy.actor_mean(th.as_tensor(model.normalizer.normalize_obs(zeros), device=model.device))
-        return Policies(mean[:, 0].cpu().numpy().astype(np.float64), model.policy.log_std.exp().cpu().numpy().astype(np.float64))
+        std = model.policy.log_std.exp()
+    return Policies(mean[:, 0].double().cpu().numpy(), std.double().cpu().numpy())
 
 
 class PolicySnapshot(RoundCallback):

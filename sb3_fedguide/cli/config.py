@@ -132,7 +132,7 @@ def complete(given: Mapping[str, Any], algo: str) -> dict[str, Any]:
 
     :raises ValueError: for the first value that is wrong
     """
-    from sb3_fedguide.offline.pretraining import PretrainingConfig
+    from sb3_fedguide.offline.config import PretrainingConfig
 
     parameters = schema.hyperparameters(algorithm(algo))
     _check_keys(given, algo, "the hyperparameters")
@@ -165,7 +165,9 @@ def config_path(conf_file: str, algo: str) -> Path:
     path = Path(conf_file)
     if not path.is_file():
         hint = "" if path.suffix else nearest(conf_file, CONFIGURATIONS)
-        raise ValueError(f"no configuration {conf_file!r}.{hint} Give {' or '.join(CONFIGURATIONS)}, or the path of a YAML file")
+        raise ValueError(
+            f"no configuration {conf_file!r}.{hint} Give {' or '.join(CONFIGURATIONS)}, or the path of a YAML file"
+        )
     return path
 
 
@@ -182,7 +184,8 @@ def read_config(path: Path) -> dict[str, dict[str, Any]]:
         raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(content, dict) or not all(isinstance(entry, dict) for entry in content.values()):
         raise ValueError(
-            f"{path}: a configuration maps families (or {DEFAULT!r}) to their hyperparameters, e.g. 'HopperHard: {{n_rounds: 100}}'"
+            f"{path}: a configuration maps families (or {DEFAULT!r}) to their hyperparameters, "
+            "e.g. 'HopperHard: {n_rounds: 100}'"
         )
     return content
 

@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from sb3_fedguide.benchmark.bandit2d import MethodResult
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
-METHODS = {"FedAvg": "fedavg", "FedGuide": "fedguide"}
+#: Trained in this order; Local is drawn as a curve only.
+METHODS = {"Local": "local", "FedAvg": "fedavg", "FedGuide": "fedguide"}
+DRAWN = ("FedAvg", "FedGuide")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -65,11 +67,11 @@ def _run(folder: Path, conf_file: str, rounds: int | None, seed: int, progress: 
     data = client_datasets(family, guided.pretraining_config.dataset_size, seed, guided.cache_dir)
     folder.mkdir(parents=True, exist_ok=True)
     picture = folder / "bandit2d.png"
-    draw(results, priors(guided, grid()), [rows.actions for rows in data], picture)  # type: ignore[arg-type]
+    draw(results, DRAWN, priors(guided, grid()), [rows.actions for rows in data], picture)  # type: ignore[arg-type]
     write_json(folder / "bandit2d.json", {result.name: {**result.measures(), "curve": result.curve} for result in results})
 
     table = Table(title="Bandit2D: four clients, four peaks", title_justify="left")
-    for column in ("", "F", "peaks kept", "E_pi[r]"):
+    for column in ("", "F", "peaks kept", r"E_pi\[r]"):
         table.add_column(column, justify="right" if column else "left")
     for result in results:
         values = result.measures()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import math
+import operator
 import re
 import types
 import typing
@@ -116,7 +118,8 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
         number = float(match["value"])
     else:
         try:
-            value = number = pydantic.TypeAdapter(typing.Union[tuple(options)]).validate_python(value, strict=True)
+            union: Any = functools.reduce(operator.or_, options)
+            value = number = pydantic.TypeAdapter(union).validate_python(value, strict=True)
         except pydantic.ValidationError:
             expected = " or ".join([_describe(option) for option in options] + ["a schedule such as lin_3e-4"] * schedule)
             raise ValueError(f"{name} must be {expected}, but it is {_show(value)}") from None

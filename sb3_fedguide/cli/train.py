@@ -95,8 +95,11 @@ def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     from sb3_fedguide.cli.config import parse_params
 
     given = parse_params(arguments.hyperparams)
-    flags = {"n_rounds": ("--rounds", arguments.rounds), "n_envs_per_client": ("--n-envs-per-client", arguments.n_envs_per_client),
-             "pretraining.dataset": ("--dataset", arguments.dataset)}  # fmt: skip
+    flags = {
+        "n_rounds": ("--rounds", arguments.rounds),
+        "n_envs_per_client": ("--n-envs-per-client", arguments.n_envs_per_client),
+        "pretraining.dataset": ("--dataset", arguments.dataset),
+    }
     for name, (flag, value) in flags.items():
         if value is not None:
             if name in given:
@@ -140,7 +143,7 @@ class Run:
         if model.round > 0:
             model.save(folder / "model.zip")
         write_json(folder / "summary.json", summary)
-        if arguments.verbose or exit_code == 0:
+        if arguments.verbose:
             print_summary(summary, str(folder))
         return exit_code
 

@@ -25,6 +25,7 @@ class PretrainingConfig(BaseModel):
     :param gamma: discount factor of the DICE value
     :param prior: ``"gaussian"`` (state-independent), ``"diffusion"``, or ``"auto"``: Gaussian for Bandit2D
     :param prior_average_every: updates between two averages of the trunk over the clients
+    :param dice_tau: weight of the new parameters in the moving average of Q's targets
     :param dice_v_coef: coefficient of V in its loss: a number, or ``"1-gamma"`` as printed in the paper
     """
 
@@ -42,8 +43,8 @@ class PretrainingConfig(BaseModel):
     prior: Literal["auto", "gaussian", "diffusion"] = "auto"
     prior_updates: Count = 5000
     prior_epochs: Count | None = None
-    prior_batch_size: Count = 256
-    prior_learning_rate: Positive = 1e-3
+    prior_batch_size: Count = 128
+    prior_learning_rate: Positive = 3e-3
     prior_width: Count = 64
     prior_average_every: Count = 50
 
@@ -53,6 +54,7 @@ class PretrainingConfig(BaseModel):
     dice_learning_rate: Positive = 1e-4
     dice_width: Count = 256
     dice_omega: Positive = 0.5
+    dice_tau: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
     dice_f: Literal["soft_chi", "kl", "chi2"] = "soft_chi"
     dice_v_coef: float | Literal["1-gamma"] = 1.0
 

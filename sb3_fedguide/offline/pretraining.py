@@ -27,6 +27,7 @@ from sb3_fedguide.offline.config import Piece, PretrainingConfig
 from sb3_fedguide.offline.datasets import OfflineData, client_datasets, normalize_observations
 from sb3_fedguide.offline.dice import DiceValue, train_dice
 from sb3_fedguide.offline.progress import Progress, TqdmProgress, stage_progress
+from sb3_fedguide.offline.trunk import federated_trunk
 from sb3_fedguide.priors import DiffusionPrior, GaussianPrior, HeadStatistics, Prior
 
 __all__ = ["PretrainedPrior", "Pretraining", "PretrainingConfig"]
@@ -211,6 +212,7 @@ class Pretraining:
                 config.dice_omega,
                 config.dice_learning_rate,
                 config.gamma,
+                tau=config.dice_tau,
                 f=config.dice_f,
                 v_coef=config.dice_v_coef,
                 progress=stage_progress(self._progress, "DICE"),
@@ -236,25 +238,27 @@ class Pretraining:
         everyone = range(self.family.n_clients) if self.family is not None else self.client_ids
         data = self.datasets(everyone)
         n_updates = max(config.n_updates("prior", len(rows)) for rows in data)
-        prior = DiffusionPrior(data[0].observations.shape[1], data[0].actions.shape[1], width=config.prior_width)
+        obs_dim, action_dim = data[0].observations.shape[1], data[0].actions.shape[1]
+        prior = DiffusionPrior(obs_dim, action_dim, width=config.prior_width, rng=stream(self.seed, Role.TRUNK))
         key = content_key(
             version=VERSION, seed=self.seed, clients=list(everyone), data=[rows.content_hash for rows in data],
-            n_updates=n_updates, **config.settings("prior"),
+            architecture=prior.arguments, n_updates=n_updates, **config.settings("prior"),
         )  # fmt: skip
 
         def build() -> Arrays:
-            from sb3_fedguide.offline.trunk import federated_trunk
-
             trained = federated_trunk(
                 prior,
-                [(rows.observations, rows.actions) for rows in data],
+                data,
                 [stream(self.seed, Role.TRUNK, client) for client in everyone],
                 n_updates,
                 config.prior_average_every,
+                config.prior_batch_size,
+                config.prior_learning_rate,
                 progress=stage_progress(self._progress, "prior"),
             )
-            arrays = {f"state/{name}": tensor.numpy() for name, tensor in trained.prior.state_dict().items()}
-            return {**arrays, "bytes_up": np.asarray(trained.bytes_up), "bytes_down": np.asarray(trained.bytes_down)}
+            state = {f"state/{name}": tensor.cpu().numpy() for name, tensor in trained.prior.state_dict().items()}
+            traffic = {"bytes_up": np.asarray(trained.upload_bytes), "bytes_down": np.asarray(trained.download_bytes)}
+            return {**state, **traffic}
 
         arrays = cached_arrays(self.cache / "pretraining" / "trunk" / f"{key}.npz", build)
         if arrays is None:

@@ -1,92 +1,244 @@
-"""Federated pretraining of the diffusion trunk: FedAvg on the trunk, heads local, then the trunk is frozen."""
+"""Federated pretraining of the diffusion trunk: FedAvg on the trunk with local heads, after which the trunk is frozen.
+
+Nothing but observation moments (once) and trunk parameters (every ``average_every`` updates) leaves a client.
+:func:`federated_trunk` runs all clients in one process; a deployment runs the same :class:`TrunkTraining` on each site with
+the clients that live there, exchanges what ``uploads()`` and ``receive()`` carry, and gets the same trunk.
+"""
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_fedguide.common.stacked import StackedLinear, stack_module
-from sb3_fedguide.priors.diffusion import DiffusionPrior, level_quantile, level_weight
+from sb3_fedguide.common.stacked import StackedLinear, client_state, stack_module
+from sb3_fedguide.offline.progress import StepProgress
+from sb3_fedguide.priors.density import training_angle
+from sb3_fedguide.priors.diffusion import DiffusionPrior
+from sb3_fedguide.priors.trunk_network import DiffusionTrunk
+
+__all__ = [
+    "TrunkResult",
+    "TrunkTraining",
+    "average_uploads",
+    "federated_trunk",
+    "merge_moments",
+    "observation_moments",
+    "upload_size",
+]
 
 Upload = dict[str, np.ndarray]
 
 
+class ActionData(Protocol):
+    """What the trunk needs of a client's dataset: ``observations (n, obs_dim)`` and ``actions (n, action_dim)``."""
+
+    @property
+    def observations(self) -> np.ndarray: ...
+
+    @property
+    def actions(self) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class TrunkResult:
+    """A pretrained trunk and what it took.
+
+    :param prior: with the averaged, frozen trunk and the merged observation moments
+    :param losses: mean velocity loss of each client between two averages, ``(n_averages, n_clients)``
+    :param upload_bytes: what each client sent (moments and trunks), as float32
+    :param download_bytes: what each client received
+    """
+
+    prior: DiffusionPrior
+    losses: np.ndarray
+    upload_bytes: int
+    download_bytes: int
+
+
 def observation_moments(observations: np.ndarray) -> Upload:
-    """What a client tells of its observations: their number, means and variances (population), per coordinate."""
+    """What a client tells of its observations: ``n_samples`` and, per coordinate, ``mean`` and ``var`` (population)."""
     observations = np.asarray(observations, dtype=np.float64)
-    return {"count": np.array(float(len(observations))), "mean": observations.mean(axis=0), "var": observations.var(axis=0)}
+    return {
+        "n_samples": np.array(len(observations), dtype=np.float64),
+        "mean": observations.mean(axis=0),
+        "var": observations.var(axis=0),
+    }
 
 
 def merge_moments(uploads: Sequence[Mapping[str, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of the union of the clients' data (Chan et al. 1979), from their moments alone."""
-    count, mean, squares = 0.0, 0.0, 0.0
-    for upload in uploads:
-        n, client_mean, client_var = float(upload["count"]), upload["mean"], upload["var"]
-        delta = client_mean - mean
+    """Mean and standard deviation of the union of the clients' data, from their moments alone (Chan et al. 1979)."""
+    if not uploads:
+        raise ValueError("merge_moments needs the moments of at least one client.")
+    count = float(uploads[0]["n_samples"])
+    mean, squares = uploads[0]["mean"], uploads[0]["var"] * count
+    for upload in uploads[1:]:
+        n = float(upload["n_samples"])
         total = count + n
-        squares = squares + client_var * n + delta**2 * count * n / total
-        mean = mean + delta * n / total
+        delta = upload["mean"] - mean
+        squares = squares + upload["var"] * n + delta**2 * (count * n / total)
+        mean = mean + delta * (n / total)
         count = total
-    return np.asarray(mean), np.sqrt(squares / count)
+    return mean, np.sqrt(squares / count)
+
+
+def average_uploads(uploads: Sequence[Mapping[str, np.ndarray]], n_samples: Sequence[int]) -> Upload:
+    """FedAvg: the mean of the clients' parameters, weighted by their samples, in float64."""
+    weights = np.asarray(n_samples, dtype=np.float64) / np.sum(n_samples)
+    return {
+        name: np.sum([w * upload[name].astype(np.float64) for w, upload in zip(weights, uploads, strict=True)], axis=0).astype(
+            np.float32
+        )
+        for name in uploads[0]
+    }
+
+
+def upload_size(upload: Mapping[str, np.ndarray]) -> int:
+    """Bytes of an upload, sent as float32."""
+    return sum(4 * int(np.size(value)) for value in upload.values())
 
 
 class TrunkTraining:
-    def __init__(self, prior, observations, actions, rngs, n_updates, batch_size=256, learning_rate=1e-3):
-        self.prior = prior
+    """The clients of one process in lockstep: stacked trunks and heads, each with its own data, stream and Adam moments.
+
+    :param prior: the network to start from, with the federation's observation moments; not changed
+    :param datasets: one per client
+    :param rngs: one generator per client; all that is random about client k's updates comes from its own
+    :param n_updates: length of the cosine schedule
+    :param batch_size: rows per client and update
+    :param learning_rate: of Adam at the start; it falls to zero
+    :raises ValueError: for data of the wrong shape or a number of generators other than that of datasets
+    """
+
+    def __init__(
+        self,
+        prior: DiffusionPrior,
+        datasets: Sequence[ActionData],
+        rngs: Sequence[np.random.Generator],
+        n_updates: int,
+        batch_size: int = 128,
+        learning_rate: float = 3e-3,
+    ) -> None:
+        if len(datasets) == 0 or len(rngs) != len(datasets):
+            raise ValueError(f"Trunk training needs one random generator per dataset, got {len(rngs)} for {len(datasets)}.")
+        if n_updates < 1 or batch_size < 1:
+            raise ValueError(f"n_updates and batch_size must be at least 1, got {n_updates} and {batch_size}.")
+        self.n_clients = len(datasets)
         self.rngs = list(rngs)
-        self.n = len(observations)
-        self.trunk = stack_trunk(prior, self.n)
-        p, d = prior.n_features, prior.action_dim
-        self.head = StackedLinear(th.zeros(self.n, d, p), th.zeros(self.n, d))
-        self.obs = [prior.standardise(th.as_tensor(o, dtype=th.float32)).numpy() for o in observations]
-        self.actions = [np.asarray(a, dtype=np.float32) for a in actions]
-        self.batch_size = batch_size
-        self.params = [*self.trunk.parameters(), *self.head.parameters()]
-        self.optimizer = th.optim.Adam(self.params, lr=learning_rate, foreach=True)
-        self.lr, self.n_updates, self.done = learning_rate, n_updates, 0
+        self.observations, self.actions = [], []
+        for dataset in datasets:
+            observations, actions, _ = prior.check_data(dataset.observations, dataset.actions, None)
+            self.observations.append(prior.standardise(th.from_numpy(observations)).numpy())
+            self.actions.append(actions)
+        self.n_samples = [len(actions) for actions in self.actions]
+        self.trunk = _stack_trunk(prior.trunk, self.n_clients)
+        # Heads start at zero, the standard normal prior.
+        self.head = StackedLinear(
+            th.zeros(self.n_clients, prior.action_dim, prior.n_features), th.zeros(self.n_clients, prior.action_dim)
+        )
+        self.batch_size, self.n_updates, self.n_done = batch_size, n_updates, 0
+        self.learning_rate = learning_rate
+        self.optimizer = th.optim.Adam([*self.trunk.parameters(), *self.head.parameters()], lr=learning_rate, foreach=True)
 
-    def batch(self):
-        obs, noisy, target, theta = [], [], [], []
-        for o, a, rng in zip(self.obs, self.actions, self.rngs, strict=True):
-            b = self.batch_size
-            rows = rng.integers(len(o), size=b)
-            q = (np.arange(b) + rng.random(b)) / b
-            th_ = level_quantile(q)
-            eps = rng.standard_normal((b, a.shape[1]), dtype=np.float32)
-            al, si = np.cos(th_)[:, None].astype(np.float32), np.sin(th_)[:, None].astype(np.float32)
-            x = a[rows]
-            obs.append(o[rows]); noisy.append(al * x + si * eps); target.append(al * eps - si * x); theta.append(th_)
-        theta = np.stack(theta)
-        f = lambda v: th.from_numpy(np.stack(v))
-        return f(obs), f(noisy), f(target), th.from_numpy(theta.astype(np.float32)), th.from_numpy(level_weight(theta).astype(np.float32))
-
-    def run(self, n):
-        for _ in range(n):
-            for g in self.optimizer.param_groups:
-                g["lr"] = self.lr * 0.5 * (1 + math.cos(math.pi * self.done / self.n_updates))
-            obs, noisy, target, theta, w = self.batch()
-            v = self.head(self.trunk(obs, noisy, theta))
-            loss = ((v - target).square().sum(-1) * w).mean(1).sum()
+    def run(self, n_updates: int) -> np.ndarray:
+        """Train every client for ``n_updates`` updates (no further than the schedule); mean losses ``(n_clients,)``."""
+        n_updates = min(n_updates, self.n_updates - self.n_done)
+        total = th.zeros(self.n_clients)
+        for _ in range(n_updates):
+            for group in self.optimizer.param_groups:
+                group["lr"] = 0.5 * self.learning_rate * (1.0 + math.cos(math.pi * self.n_done / self.n_updates))
+            obs, noisy, theta, velocity = self._batch()
+            predicted = self.head(self.trunk(self.trunk.encoder(obs), noisy, theta))
+            losses = (predicted - velocity).square().sum(dim=-1).mean(dim=-1)
             self.optimizer.zero_grad()
-            loss.backward()
+            losses.sum().backward()  # every client has its own parameters, so this is each one's own gradient
             self.optimizer.step()
-            self.done += 1
-        return float(loss) / self.n
+            total += losses.detach()
+            self.n_done += 1
+        return (total / max(n_updates, 1)).numpy()
 
-    def average(self):
+    def uploads(self) -> list[Upload]:
+        """Each client's trunk, float32, keyed like the trunk's state dict."""
+        state = self.trunk.state_dict()
+        return [{name: value.numpy() for name, value in client_state(state, k).items()} for k in range(self.n_clients)]
+
+    def receive(self, trunk: Mapping[str, np.ndarray]) -> None:
+        """Continue every client from the averaged trunk; heads and optimiser moments stay."""
         with th.no_grad():
-            for p in self.trunk.parameters():
-                p.copy_(p.double().mean(0, keepdim=True).expand_as(p))
+            for name, parameter in self.trunk.named_parameters():
+                parameter.copy_(th.from_numpy(trunk[name]).expand_as(parameter))
+
+    def _batch(self) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
+        """Standardised observations, noisy actions, noise angles and velocities, ``(n_clients, batch, ...)``."""
+        size = self.batch_size
+        parts = []
+        for observations, actions, rng in zip(self.observations, self.actions, self.rngs, strict=True):
+            rows = rng.integers(len(actions), size=size)
+            theta = training_angle((np.arange(size) + rng.random(size)) / size)  # stratified over the batch
+            eps = rng.standard_normal((size, actions.shape[1]), dtype=np.float32)
+            alpha, sigma = np.cos(theta, dtype=np.float32)[:, None], np.sin(theta, dtype=np.float32)[:, None]
+            clean = actions[rows]
+            parts.append(
+                (observations[rows], alpha * clean + sigma * eps, theta.astype(np.float32), alpha * eps - sigma * clean)
+            )
+        obs, noisy, angles, velocity = (th.from_numpy(np.stack(part)) for part in zip(*parts, strict=True))
+        return obs, noisy, angles, velocity
 
 
-def stack_trunk(prior, n):
-    trunk = copy.deepcopy(prior.trunk)
-    trunk.input = stack_module(trunk.input, n)
-    trunk.blocks = nn.ModuleList(stack_module(b, n) for b in trunk.blocks)
-    return trunk
+def federated_trunk(
+    prior: DiffusionPrior,
+    datasets: Sequence[ActionData],
+    rngs: Sequence[np.random.Generator],
+    n_updates: int = 5000,
+    average_every: int = 50,
+    batch_size: int = 128,
+    learning_rate: float = 3e-3,
+    progress: StepProgress | None = None,
+) -> TrunkResult:
+    """Pretrain the trunk of ``prior`` by FedAvg over the clients, all in this process.
+
+    :param prior: architecture and initial weights; not changed
+    :param datasets: one per client
+    :param rngs: one generator per client
+    :param n_updates: updates of each client
+    :param average_every: updates between two averages
+    :param batch_size: rows per client and update
+    :param learning_rate: of Adam, falling to zero on a cosine
+    :param progress: called with (updates done, updates in all) after every average
+    :raises ValueError: see :class:`TrunkTraining`; also for ``average_every`` below 1
+    """
+    if average_every < 1:
+        raise ValueError(f"average_every must be at least 1, got {average_every}.")
+    prior = copy.deepcopy(prior)
+    moments = [observation_moments(dataset.observations) for dataset in datasets]
+    mean, std = merge_moments(moments)
+    prior.set_observation_moments(mean, std)
+    upload_bytes, download_bytes = upload_size(moments[0]), upload_size({"mean": mean, "std": std})
+    training = TrunkTraining(prior, datasets, rngs, n_updates, batch_size, learning_rate)
+    losses = []
+    while training.n_done < n_updates:
+        losses.append(training.run(average_every))
+        uploads = training.uploads()
+        trunk = average_uploads(uploads, training.n_samples)
+        training.receive(trunk)
+        upload_bytes += upload_size(uploads[0])
+        download_bytes += upload_size(trunk)
+        if progress is not None:
+            progress(training.n_done, n_updates)
+    prior.trunk.load_state_dict({name: th.from_numpy(value) for name, value in trunk.items()})
+    return TrunkResult(prior, np.stack(losses), upload_bytes, download_bytes)
+
+
+def _stack_trunk(trunk: DiffusionTrunk, n_clients: int) -> DiffusionTrunk:
+    """``n_clients`` trainable copies as one module, with the same parameter names and a leading client dimension."""
+    stacked = copy.deepcopy(trunk)
+    for name in ("encoder", "level", "action"):
+        setattr(stacked, name, stack_module(getattr(trunk, name), n_clients))
+    stacked.blocks = nn.ModuleList(stack_module(block, n_clients) for block in trunk.blocks)
+    return stacked.requires_grad_(True)

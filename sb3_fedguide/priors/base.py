@@ -134,7 +134,7 @@ class Prior(nn.Module):
 
     # Shared checks and conversions
 
-    def _check_data(
+    def check_data(
         self, obs: np.ndarray, actions: np.ndarray, weights: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The data as float32 and the weights as float64, or a ``ValueError`` that says what is wrong."""

@@ -3,13 +3,14 @@
 ``x_t = alpha(t) x_0 + sigma(t) eps`` with ``d log alpha = -b(t) / 2 dt`` and ``b(t) = 0.1 + 19.9 t``: the limit of DDPM's
 K = 1000 steps with beta from 1e-4 to 2e-2, step ``k`` (from 0) at ``t = (k + 1) / K``.
 
-Since ``alpha^2 + sigma^2 = 1``, noise levels are angles, ``alpha = cos(theta)`` and ``sigma = sin(theta)``, and the probability
-flow takes its plainest form (Salimans and Ho 2022, appendix D): ``dx/dtheta = v`` with the velocity
+Since ``alpha^2 + sigma^2 = 1``, noise levels are angles, ``alpha = cos(theta)`` and ``sigma = sin(theta)``, and the
+probability flow takes its plainest form (Salimans and Ho 2022, appendix D): ``dx/dtheta = v`` with the velocity
 ``v = (eps - sigma x) / alpha``. Here a model is a function that returns ``v``.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -32,6 +33,17 @@ THETA_MIN = float(noise_angle(1.0 / K))
 THETA_MAX = float(noise_angle(1.0))
 
 
+def training_angle(quantile: np.ndarray | float) -> np.ndarray:
+    """Quantiles (of values in [0, 1]) of the angles that priors are trained on: uniform in ``sqrt(theta)``."""
+    low, high = math.sqrt(THETA_MIN), math.sqrt(THETA_MAX)
+    return (low + (high - low) * np.asarray(quantile, dtype=np.float64)) ** 2
+
+
+def uniform_step_angle(quantile: np.ndarray | float) -> np.ndarray:
+    """Quantiles (of values in [0, 1]) of the angle of a uniformly drawn step ``k``."""
+    return noise_angle((1.0 + (K - 1.0) * np.asarray(quantile, dtype=np.float64)) / K)
+
+
 def ode_log_density(
     velocity: Callable[[th.Tensor, float], tuple[th.Tensor, th.Tensor]],
     x: th.Tensor,
@@ -40,9 +52,9 @@ def ode_log_density(
 ) -> th.Tensor:
     """Log-density of ``x`` under the probability flow, by RK4: ``log p(x) = log p_1(x_1) + int tr(dv/dx) dtheta``.
 
-    (Song et al. 2021, eq. 39.) The steps are equal in ``u = sqrt(theta)``, which grows like the fourth root of ``t`` at first: the
-    velocity of sharp data varies fastest at small noise. On Gaussians and mixtures with deviations of 0.03 to 0.3 the error
-    is a half to a quarter of that of equal steps in ``sqrt(t)``.
+    (Song et al. 2021, eq. 39.) The steps are equal in ``u = sqrt(theta)``, which grows like the fourth root of ``t`` at first:
+    the velocity of sharp data varies fastest at small noise. On Gaussians and mixtures with deviations of 0.03 to 0.3 the
+    error is a half to a quarter of that of equal steps in ``sqrt(t)``.
 
     :param velocity: ``(x, theta) -> (v, trace of dv/dx)``, of shapes ``(..., d)`` and ``(...)``
     :param x: ``(..., d)``
@@ -92,7 +104,7 @@ def ddim_sample(velocity: Callable[[th.Tensor, float], th.Tensor], noise: th.Ten
         raise ValueError(f"Sampling needs at least one denoising step, got n_steps={n_steps}.")
     angles = np.append(sample_angles(n_steps), 0.0)
     x = noise
-    for theta, following in zip(angles[:-1], angles[1:], strict=True):
+    for theta, following in itertools.pairwise(angles):
         delta = float(theta - following)
         x = math.cos(delta) * x - math.sin(delta) * velocity(x, float(theta))
     return x

@@ -35,7 +35,7 @@ class GaussianPrior(Prior):
         n_draws: int | None = None,
     ) -> HeadStatistics:
         """Weighted moments of the actions; nothing is random here, ``rng`` and ``n_draws`` are not used."""
-        _, actions, weights = self._check_data(obs, actions, weights)
+        _, actions, weights = self.check_data(obs, actions, weights)
         features = _with_one(actions)
         gram = (features * weights[:, None]).T @ features
         return HeadStatistics(gram, np.zeros((self.n_features + 1, self.action_dim)), float(weights.sum()))
@@ -51,7 +51,7 @@ class GaussianPrior(Prior):
 
     def feature_moment(self, obs: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """``E[[a; 1][a; 1]^T]``: the head's output is the score itself."""
-        _, actions, _ = self._check_data(obs, actions, None)
+        _, actions, _ = self.check_data(obs, actions, None)
         features = _with_one(actions)
         return features.T @ features / len(features)
 

@@ -25,7 +25,7 @@ def mixture_log_prob(
     :param row: the client's weights ``R_i``, ``(n_experts,)``, summing to one
     :param obs: ``(batch, obs_dim)``, raw
     :param actions: ``(batch, action_dim)``
-    :param min_weight: experts with less weight are left out and the others renormalised; each expert costs a density evaluation
+    :param min_weight: experts with less weight are left out and the others renormalised (an expert costs a density evaluation)
     :param n_steps: integration steps per density; default the prior's
     :return: ``(batch,)``; far off the experts' support very negative, callers clip
     :raises ValueError: for a row that is no probability vector, or when no weight reaches ``min_weight``

@@ -14,6 +14,7 @@ from fed_envs.bandit2d import ACTION_LIMIT, PEAKS, reward
 from sb3_fedguide.benchmark.bandit2d import MethodResult, Priors
 
 CLIENT_COLORS = ("#d1495b", "#2e86ab", "#3a7d44", "#8e5ea2")
+METHOD_COLORS = ("#999999", "#2e86ab", "#d1495b", "#3a7d44")
 DENSITY_MAP = "viridis"
 N_GRID = 161
 
@@ -24,15 +25,19 @@ def grid() -> np.ndarray:
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
-def draw(methods: Sequence[MethodResult], priors: Priors, data: Sequence[np.ndarray], path: Path) -> None:
+def draw(
+    results: Sequence[MethodResult], drawn: Sequence[str], priors: Priors, data: Sequence[np.ndarray], path: Path
+) -> None:
     """Write the figure.
 
-    :param methods: one row each
+    :param results: one learning curve each
+    :param drawn: names of those that get a row of densities
     :param priors: FedGuide's, on :func:`grid`
     :param data: each client's offline actions, ``(n, 2)``
     :param path: a ``.png``, or any other format that matplotlib writes
     """
     points, n_clients = grid(), len(data)
+    methods = [result for result in results if result.name in drawn]
     columns = n_clients + 1
     figure = Figure(figsize=(2.5 * columns, 2.75 * (1 + len(methods))), layout="constrained")
     FigureCanvasAgg(figure)
@@ -43,7 +48,7 @@ def draw(methods: Sequence[MethodResult], priors: Priors, data: Sequence[np.ndar
     _data(top[1], data)
     _contours(top[2], priors.clients, "each client's own prior")
     _density(top[3], priors.server, "OT-MoE global prior")
-    _curves(top[4], methods)
+    _curves(top[4], results)
     for blank in top[5:]:
         blank.axis("off")
 
@@ -67,7 +72,7 @@ def draw(methods: Sequence[MethodResult], priors: Priors, data: Sequence[np.ndar
             fontsize=9,
         )
         if guided:
-            row[0].set_xlabel("colour: policy, dashed: the client's\nmixture prior, cross: its mean", fontsize=8)
+            row[0].set_xlabel("colour: policy, cross: its mean, dashed:\nthe client's mixture prior (2 std)", fontsize=8)
     figure.savefig(path, dpi=130)
 
 
@@ -95,13 +100,13 @@ def _outline(axes: Axes, density: np.ndarray) -> None:
 def _data(axes: Axes, data: Sequence[np.ndarray]) -> None:
     for client, (actions, color) in enumerate(zip(data, _colors(len(data)), strict=True)):
         axes.plot(*actions.T, ".", color=color, markersize=1.2, alpha=0.6)
-        middle = actions.mean(axis=0)
-        axes.text(*(0.45 * middle), str(client), color=color, ha="center", va="center", fontsize=11, fontweight="bold")
+        x, y = 0.45 * actions.mean(axis=0)
+        axes.text(x, y, str(client), color=color, ha="center", va="center", fontsize=11, fontweight="bold")
     _frame(axes, "clients' offline data")
 
 
 def _curves(axes: Axes, methods: Sequence[MethodResult]) -> None:
-    for method, color in zip(methods, ("#777777", "#d1495b", "#2e86ab"), strict=False):
+    for method, color in zip(methods, METHOD_COLORS, strict=False):
         axes.plot(*np.array(method.curve).T, color=color, label=method.name, linewidth=1.6)
     axes.set_title("average return", fontsize=10)
     axes.set_xlabel("round", fontsize=8, labelpad=1)
@@ -112,7 +117,7 @@ def _curves(axes: Axes, methods: Sequence[MethodResult]) -> None:
 
 
 def _peaks(axes: Axes, color: str) -> None:
-    axes.scatter(*PEAKS.T, s=70, facecolors="none", edgecolors=color, linewidths=0.8)
+    axes.scatter(PEAKS[:, 0], PEAKS[:, 1], s=70, facecolors="none", edgecolors=color, linewidths=0.8)
 
 
 def _frame(axes: Axes, title: str) -> None:

@@ -1,0 +1,70 @@
+# Needs Python 3.11 or newer and make; everything else goes into a virtual environment of its own.
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+RUNTIME := $(VENV)/.runtime-installed
+TOOLS := $(VENV)/.tools-installed
+# Small networks gain nothing from threads, and threads of several libraries get into each other's way.
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: help install train demo test test-slow lint type format clean
+
+help:
+	@echo "make train      install, then FedGuide on HopperHard, end to end"
+	@echo "make demo       Bandit2D in a minute: FedAvg beside FedGuide, with a picture in runs/demo"
+	@echo "make test       the test suite"
+	@echo "make test-slow  the long tests as well"
+	@echo "make lint type  ruff, mypy"
+	@echo "make format     rewrite the code with ruff"
+	@echo "make clean      remove caches and builds; runs, logs and the environment stay"
+
+train: $(RUNTIME)
+	$(BIN)/python train.py --algo fedguide --env HopperHard --progress $(ARGS)
+
+demo: $(RUNTIME)
+	$(BIN)/python -m sb3_fedguide demo --progress $(ARGS)
+
+test: $(TOOLS)
+	$(BIN)/python -m pytest $(ARGS)
+
+test-slow: $(TOOLS)
+	$(BIN)/python -m pytest -m "slow or not slow" $(ARGS)
+
+lint: $(TOOLS)
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+
+type: $(TOOLS)
+	$(BIN)/python -m mypy
+
+format: $(TOOLS)
+	$(BIN)/python -m ruff check --fix .
+	$(BIN)/python -m ruff format .
+
+install: $(RUNTIME)
+
+$(BIN)/python:
+	@for candidate in $(PYTHON) python3.11 python3.12 python3.13 python3; do \
+		if "$$candidate" -c 'import sys, ensurepip, venv; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then \
+			echo "creating $(VENV) with $$candidate"; \
+			exec "$$candidate" -m venv "$(VENV)"; \
+		fi; \
+	done; \
+	echo "No Python 3.11 or newer with its venv module was found (on Debian and Ubuntu: python3.11 and python3.11-venv)." >&2; \
+	echo "If it has another name, say so: make PYTHON=/path/to/python ..." >&2; \
+	exit 1
+
+# torch first: what follows finds its requirement met, by whichever build of it is wanted here
+$(RUNTIME): setup.cfg pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) install --quiet --constraint constraints.txt torch
+	$(PIP) install --quiet --constraint constraints.txt --editable .
+	@touch $@
+
+$(TOOLS): $(RUNTIME)
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[test]'
+	@touch $@
+
+clean:
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

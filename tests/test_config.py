@@ -1,0 +1,206 @@
+"""The resolver of hyperparameters, and every configuration that ships."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch as th
+
+import fed_envs
+from sb3_fedguide.algorithms import ALGORITHMS, algorithm
+from sb3_fedguide.cli import schema
+from sb3_fedguide.cli.config import CONFIGURATIONS, config_path, parse_params, read_config, resolve
+from sb3_fedguide.common.federated_ppo import FederatedPPO
+
+BANDIT = fed_envs.load_family("Bandit2D")
+
+
+@pytest.fixture(scope="module")
+def one_client():
+    """One client of a family, made once for all algorithms."""
+    made: dict[tuple[str, int], fed_envs.FederatedVecEnv] = {}
+
+    def make(family: str, n_envs: int) -> fed_envs.FederatedVecEnv:
+        if (family, n_envs) not in made:
+            made[family, n_envs] = fed_envs.FederatedVecEnv(family, n_envs, clients=[0])
+        return made[family, n_envs]
+
+    yield make
+    for env in made.values():
+        env.close()
+
+
+@pytest.mark.parametrize("conf", CONFIGURATIONS)
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_shipped_configuration_constructs_what_it_says(algo, conf, one_client):
+    assert set(read_config(config_path(conf, algo))) <= {"default", *fed_envs.FAMILIES}
+    for name in fed_envs.FAMILIES:
+        config = resolve(algo, fed_envs.load_family(name), conf)
+        assert config.values.keys() == {"policy", "n_rounds", *schema.hyperparameters(algorithm(algo))}
+        model = config.make(one_client(name, config.values["n_envs_per_client"]), seed=0)
+        for parameter, value in config.values.items():
+            if parameter not in ("policy", "n_rounds", "policy_kwargs", "pretraining", "stats_window_size", "clip_range"):
+                assert getattr(model, parameter) == value, (name, parameter)
+        assert model.clip_range(1.0) == config.values["clip_range"]
+        assert model.n_steps * model.n_envs_per_client == model.rollout_size == config.values["rollout_size"]
+        for field, value in config.values["pretraining"].items():
+            assert getattr(model.pretraining_config, field) == value
+        log_std = config.values["policy_kwargs"]["log_std_init"]
+        assert th.allclose(model.policy.log_std, th.full_like(model.policy.log_std, log_std))
+
+
+@pytest.mark.parametrize("conf", CONFIGURATIONS)
+@pytest.mark.parametrize("name", fed_envs.FAMILIES)
+def test_methods_are_compared_under_the_same_settings(name, conf):
+    """The same PPO, budget, networks, cloning and normalisation; only the paper's epochs differ between methods."""
+    family = fed_envs.load_family(name)
+    shared = {"n_rounds", "policy", *schema.hyperparameters(FederatedPPO)} - {"pretraining"}
+    if conf == "paper":
+        shared -= {"n_epochs"}
+    local = resolve("local", family, conf).values
+    for algo in ALGORITHMS:
+        values = resolve(algo, family, conf).values
+        assert {key: values[key] for key in shared} == {key: local[key] for key in shared}
+        for field, value in values["pretraining"].items():
+            if field.startswith(("bc_", "dataset")):
+                assert value == local["pretraining"][field], field
+
+
+def test_the_papers_settings():
+    hopper, reacher = fed_envs.load_family("HopperHard"), fed_envs.load_family("Reacher")
+    values = resolve("fedguide", hopper, "paper").values
+    assert (values["n_rounds"], values["rollout_size"], values["n_epochs"], values["batch_size"]) == (100, 4096, 4, 64)
+    assert (values["learning_rate"], values["normalize"], values["bc_weight"]) == (1e-4, False, 0.3)
+    assert (values["lambda_trust"], values["lambda_prior"], values["prior_horizon"], values["eta"]) == (0.05, 0.5, 50, 0.05)
+    assert (values["prior_loss"], values["adapt"], values["calibrate"], values["beta"]) == ("snis", "none", False, 0.5)
+    assert values["policy_kwargs"]["net_arch"] == [256, 256]
+    assert values["pretraining"]["dataset_size"] == 200_000 and values["pretraining"]["dice_epochs"] == 80
+    assert resolve("fedavg", hopper, "paper").values["n_epochs"] == 10
+    assert resolve("fedguide-a", hopper, "paper").values["average_every"] == 5
+    assert resolve("fedguide", reacher, "paper").values["rollout_size"] == 2048
+    assert resolve("fedguide", reacher, "paper").values["pretraining"]["dataset_size"] == 20_000
+    bandit = resolve("fedguide", BANDIT, "paper").values
+    assert (bandit["n_rounds"], bandit["rollout_size"], bandit["prior_horizon"]) == (60, 200, 60)
+    assert bandit["policy_kwargs"] == {**values["policy_kwargs"], "log_std_init": -1.0}
+    assert (bandit["pretraining"]["dataset_size"], bandit["pretraining"]["dice_epochs"]) == (1000, 100)
+    assert bandit["pretraining"]["bc_batch_size"] == 512  # nested settings are merged, not replaced
+
+
+def write(path: Path, text: str) -> str:
+    path.write_text(text)
+    return str(path)
+
+
+def test_layers_default_then_family_then_overrides(tmp_path):
+    conf = write(
+        tmp_path / "mine.yml",
+        "default: &base {n_rounds: 7, learning_rate: 1e-3, gamma: 0.9, policy_kwargs: {net_arch: [8], activation_fn: relu}}\n"
+        "Bandit2D: {<<: *base, gamma: 0.8, policy_kwargs: {log_std_init: -2}}\n",
+    )
+    values = resolve("local", BANDIT, conf, overrides={"policy_kwargs.net_arch": [4, 4], "vf_coef": 1}).values
+    assert (values["n_rounds"], values["learning_rate"], values["gamma"], values["vf_coef"]) == (7, 1e-3, 0.8, 1)
+    assert values["policy_kwargs"] == {"net_arch": [4, 4], "activation_fn": "relu", "log_std_init": -2, "ortho_init": True}
+    assert resolve("local", fed_envs.load_family("Hopper"), conf).values["gamma"] == 0.9
+    assert values["batch_size"] == 64  # the constructor's own
+
+
+def test_a_users_family_starts_from_the_settings_of_its_backbone():
+    content = {**BANDIT.to_dict(), "family": "MyBandit"}
+    mine = fed_envs.Family.model_validate(content)
+    config = resolve("fedguide", mine)
+    assert config.entry == "Bandit2D" and config.values == resolve("fedguide", BANDIT).values
+    assert resolve("fedguide", mine, entry="Reacher").entry == "Reacher"
+
+
+def test_rounds_from_timesteps_count_all_clients():
+    one_round = 4 * 200
+    assert resolve("local", BANDIT, n_timesteps=3 * one_round).n_rounds == 3
+    assert resolve("local", BANDIT, n_timesteps=3 * one_round + 1).n_rounds == 4
+    with pytest.raises(ValueError, match="n_timesteps=0"):
+        resolve("local", BANDIT, n_timesteps=0)
+
+
+def test_schedules_reach_the_algorithm_and_stay_plain_in_the_config():
+    overrides = {"learning_rate": "lin_3e-4", "clip_range": "lin_0.2", "beta": "lin_1"}
+    config = resolve("fedguide", BANDIT, overrides=overrides)
+    assert config.values["learning_rate"] == "lin_3e-4"
+    model = config.make(BANDIT, seed=0)
+    assert model.lr_schedule(1.0) == pytest.approx(3e-4) and model.lr_schedule(0.5) == pytest.approx(1.5e-4)
+    assert model.clip_range(0.25) == pytest.approx(0.05)
+    assert model.beta(0.5) == pytest.approx(0.5)
+
+
+def test_networks_are_plain_data_that_become_modules():
+    config = resolve("local", BANDIT, overrides=parse_params(["policy_kwargs.net_arch:{pi: [8], vf: [16]}",
+                                                              "policy_kwargs.activation_fn:relu"]))  # fmt: skip
+    policy = config.make(BANDIT, seed=0).policy
+    assert policy.mlp_extractor.latent_dim_pi == 8 and policy.mlp_extractor.latent_dim_vf == 16
+    assert isinstance(policy.mlp_extractor.policy_net[1], th.nn.ReLU)
+
+
+def test_params_are_yaml_and_never_evaluated():
+    given = ["a:1", "b:3e-4", "c:[64, 64]", "d:null", "e:true", "f:lin_3e-4", "g:-1.5", "h:__import__('os').getcwd()", "i:a:b"]
+    assert parse_params(given) == {
+        "a": 1, "b": 3e-4, "c": [64, 64], "d": None, "e": True, "f": "lin_3e-4", "g": -1.5,
+        "h": "__import__('os').getcwd()", "i": "a:b",
+    }  # fmt: skip
+    with pytest.raises(ValueError, match="is not a number, text or"):
+        parse_params(["a:!!python/object/apply:os.getcwd []"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"learning_rat": 1}, "Did you mean 'learning_rate'"),
+        ({"clients": [0]}, "unknown hyperparameter 'clients'"),  # has no place in a configuration
+        ({"seed": 1}, "unknown hyperparameter 'seed'"),
+        ({"average": "all"}, "unknown hyperparameter 'average'"),  # FedAvg's
+        ({"n_epochs": 4.5}, "n_epochs must be an integer"),
+        ({"n_epochs": True}, "n_epochs must be an integer"),
+        ({"n_epochs": 0}, "n_epochs=0 must be at least 1"),
+        ({"normalize": 1}, "normalize must be true or false"),
+        ({"gamma": 1.5}, "gamma=1.5 must be between 0 and 1"),
+        ({"gamma": float("nan")}, "must be finite"),
+        ({"learning_rate": 0}, "learning_rate=0 must be positive"),
+        ({"learning_rate": "3e-4x"}, "a schedule such as lin_3e-4"),
+        ({"learning_rate": "lin_-1"}, "a schedule such as lin_3e-4"),
+        ({"batch_size": "lin_64"}, "batch_size must be an integer"),
+        ({"prior_loss": "snip"}, "'snis' or 'sample'"),
+        ({"beta": "automatic"}, "'auto'"),
+        ({"policy": "CnnPolicy"}, "policy must be 'MlpPolicy'"),
+        ({"policy_kwargs.net_arc": [1]}, "Did you mean 'net_arch'"),
+        ({"policy_kwargs.net_arch": [0]}, "greater than 0"),
+        ({"policy_kwargs.net_arch": {"pi": [8]}}, "both pi and vf"),
+        ({"policy_kwargs.activation_fn": "nn.Tanh"}, "'tanh'"),
+        ({"policy_kwargs": 3}, "must be a mapping"),
+        ({"pretraining.dice_update": 3}, "Did you mean 'dice_updates'"),
+        ({"pretraining.dice_updates": "100"}, "valid integer"),
+        ({"pretraining.dice_updates": 0}, "greater than or equal to 1"),
+        ({"pretraining.gamma": 0.9}, "the algorithm's own gamma"),
+        ({"n_rounds": 0}, "n_rounds=0 must be at least 1"),
+        ({"env.x": 0}, "only pretraining and policy_kwargs have parts"),
+    ],
+)  # fmt: skip
+def test_wrong_values_are_refused_with_the_remedy(overrides, message):
+    with pytest.raises(ValueError, match=message):
+        resolve("fedguide", BANDIT, overrides=overrides)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("Bandit2D: {n_rounds: 3, gama: 0.9}", "Did you mean 'gamma'"),
+        ("Bandit2D: 3", "maps families"),
+        ("- 1", "maps families"),
+        ("", "maps families"),
+        ("Bandit2D: {n_rounds: 3", "not valid YAML"),
+        ("Bandit2D: {n_rounds: 3, n_rounds: 4}", "stands twice"),
+        ("Bandit2D: {n_rounds: 3}\nBandit2D: {n_rounds: 4}", "stands twice"),
+        ("Bandit2D: {gamma: 0.9}", "number of rounds is missing"),
+        ("Bandit2D: {n_rounds: !!python/name:os.system ''}", "not valid YAML"),
+    ],
+)
+def test_wrong_files_are_refused_with_the_reason(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        resolve("local", BANDIT, write(tmp_path / "wrong.yml", text))
