@@ -50,7 +50,7 @@ def run_one(args: argparse.Namespace, method: str, seed: int) -> None:
             return
         shutil.copyfile(summaries[0], path.with_suffix(".part"))
         path.with_suffix(".part").replace(path)
-    print(f"{method} seed {seed}: {json.loads(path.read_text())['average']:.1f}", flush=True)
+    print(f"{method} seed {seed}: {json.loads(path.read_text())['deployed']['average']:.1f}", flush=True)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -61,20 +61,20 @@ def run(args: argparse.Namespace) -> None:
 
 def table(args: argparse.Namespace) -> None:
     """F (mean, deviation), W and CV over seeds, as the paper defines them."""
-    print(f"| method | seeds | F | worst client | W | CV of the last 20 rounds | round 25 | round 50 | broadcast | paper F |")
+    print("| method | seeds | F | worst client | W | CV of the last 20 rounds | round 25 | round 50 | broadcast | paper F |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     for method in args.methods:
         files = sorted(result_path(args, method, 0).parent.glob(f"{method}-seed*.json"))
         runs = [json.loads(file.read_text()) for file in files]
         if not runs:
             continue
-        final = np.array([result["average"] for result in runs])
-        worst = np.mean([result["worst_client"] for result in runs])
-        curves = [{int(round): value for round, value in result["curve"]["deployed"].items()} for result in runs]
+        final = np.array([result["deployed"]["average"] for result in runs])
+        worst = np.mean([result["deployed"]["worst_client"] for result in runs])
+        curves = [dict(result["deployed"]["curve"]) for result in runs]
         last = [[value for round, value in curve.items() if round > max(curve) - 20] for curve in curves]
         volatility = np.mean([np.std(values) / abs(np.mean(values)) for values in last])
         early = [f"{np.mean([curve[round] for curve in curves]):.0f}" if round in curves[0] else "-" for round in (25, 50)]
-        broadcast = [result["broadcast_average"] for result in runs if result.get("broadcast_average") is not None]
+        broadcast = [result["broadcast"]["average"] for result in runs if result.get("broadcast")]
         shared = f"{np.mean(broadcast):.4g}" if broadcast else "-"
         paper = PAPER.get(args.env, {}).get(method, "-")
         print(

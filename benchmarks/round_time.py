@@ -86,14 +86,20 @@ def main() -> None:
         "ratio": {"median": statistics.median(ratios), "min": min(ratios), "max": max(ratios)},
         "all": {"lockstep": ours, "sb3": theirs},
         "machine": {"processor": platform.processor() or platform.machine(), "torch_threads": th.get_num_threads()},
-        "versions": {"torch": th.__version__, "stable_baselines3": stable_baselines3.__version__, "mujoco": mujoco.__version__},
+        "versions": {
+            "torch": th.__version__,
+            "stable_baselines3": stable_baselines3.__version__,
+            "mujoco": mujoco.__version__,
+        },
     }
     suffix = f"_x{args.n_envs_per_client}" if args.n_envs_per_client > 1 else ""
     path = Path(__file__).parent / "results" / f"round_time_{args.env}_{args.algo}{suffix}.json"
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(result, indent=1) + "\n")
-    print(f"lockstep {result['seconds_per_round']['lockstep']:.2f} s, SB3 {result['seconds_per_round']['sb3']:.2f} s a round, "
-          f"ratio {result['ratio']['median']:.1f} ({min(ratios):.1f} to {max(ratios):.1f})")
+    print(
+        f"lockstep {result['seconds_per_round']['lockstep']:.2f} s, SB3 {result['seconds_per_round']['sb3']:.2f} s a round, "
+        f"ratio {result['ratio']['median']:.1f} ({min(ratios):.1f} to {max(ratios):.1f})"
+    )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """Federated reinforcement learning for Stable-Baselines3: FedGuide, its baselines, and a Local control.
 
-    from sb3_fedguide import FedGuide
+from sb3_fedguide import FedGuide
 
-    model = FedGuide("MlpPolicy", "HopperHard", seed=0, tensorboard_log="runs")
-    model.learn(total_timesteps=100 * 8 * 4096, progress_bar=True)
-    model.client(3)    # client 3 as an ordinary stable_baselines3.PPO
+model = FedGuide("MlpPolicy", "HopperHard", seed=0, tensorboard_log="runs")
+model.learn(total_timesteps=100 * 8 * 4096, progress_bar=True)
+model.client(3)    # client 3 as an ordinary stable_baselines3.PPO
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -125,7 +126,9 @@ def test_other_commands(capsys):
     assert capsys.readouterr().err.startswith("fedguide train: error: unknown environment")
 
 
-@pytest.mark.parametrize("arguments", ["--help", "--env Bandit3D", "--algo nothing --env Bandit2D", "--env Bandit2D -params x"])
+@pytest.mark.parametrize(
+    "arguments", ["--help", "--env Bandit3D", "--algo nothing --env Bandit2D", "--env Bandit2D -params x"]
+)
 def test_neither_help_nor_a_mistyped_name_waits_for_pytorch(arguments):
     script = (
         "import sys\nfrom sb3_fedguide.cli.train import main\n"
@@ -211,10 +214,23 @@ def test_fedguide_from_the_offline_stage_to_the_table(tmp_path, capsys):
     folder = tmp_path / "fedguide-a" / "Bandit2D_1"
     assert not (folder / "tb").exists()
     assert len(list((tmp_path / "tb" / "Bandit2D" / "fedguide-a_1").iterdir())) == 1
+    documented = (ROOT / "docs" / "log_keys.md").read_text()
+    for key in _tensorboard_keys(tmp_path / "tb" / "Bandit2D" / "fedguide-a_1"):
+        assert f"`{re.sub(r'^client_[0-9]+/', 'client_<k>/', key)}`" in documented, key
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["bytes_up"] > 0 and summary["bytes_down"] > 0 and summary["seconds"]["pretraining"] > 0
     model = FedGuide.load(folder / "model.zip")
     assert model.beta == "auto" and model.pretraining_config.dice_updates == 2
+
+
+def _tensorboard_keys(folder: Path) -> list[str]:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    keys = events.Tags()["scalars"]
+    assert "federated/bytes_up" in keys and "client_3/eval_mean_reward" in keys
+    return keys
 
 
 def test_an_interrupted_run_keeps_what_there_is(tmp_path, monkeypatch, capsys):

@@ -177,7 +177,7 @@ def test_normalizer_equals_vec_normalize(point_envs):
     np.testing.assert_allclose(ours.normalize_obs(env.get_original_obs()[None])[0], normalized, atol=1e-6)
     rng = np.random.default_rng(0)
     for _ in range(60):
-        normalized, rewards, dones, infos = env.step(rng.uniform(-1, 1, (3, 2)))
+        normalized, rewards, dones, _ = env.step(rng.uniform(-1, 1, (3, 2)))
         raw = env.get_original_obs()
         ours.update_obs(raw[None])
         scaled = ours.scale_reward(env.get_original_reward()[None], dones[None])

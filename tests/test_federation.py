@@ -122,9 +122,7 @@ def test_round_events_and_stock_callbacks(point_envs, small, tmp_path):
 
 
 def test_whole_training_is_one_tensorboard_file_with_schedules(point_envs, small, tmp_path):
-    model = Local(
-        "MlpPolicy", point_envs(2), learning_rate=lambda left: 1e-3 * left, tensorboard_log=str(tmp_path), **small
-    )
+    model = Local("MlpPolicy", point_envs(2), learning_rate=lambda left: 1e-3 * left, tensorboard_log=str(tmp_path), **small)
     model.learn(4 * 2 * model.rollout_size)
     assert len(list(tmp_path.rglob("events.out.tfevents.*"))) == 1
     assert model.policy.optimizer.param_groups[0]["lr"] == pytest.approx(0.0)

@@ -189,7 +189,9 @@ def test_only_heads_and_cost_rows_leave_a_client(tiny):
     assert set(payload) == {HEAD, COST_ROW}
     assert payload[HEAD].shape == (3, 17) and payload[COST_ROW].shape == (3,)
     assert all(array.dtype == np.float32 for array in payload.values())
-    np.testing.assert_allclose(payload[COST_ROW], score_cost(model.heads[0], model.experts[0], model.score_moments[0]), rtol=1e-5)
+    np.testing.assert_allclose(
+        payload[COST_ROW], score_cost(model.heads[0], model.experts[0], model.score_moments[0]), rtol=1e-5
+    )
     assert model.mixture_rows.shape == (2, 3)
     np.testing.assert_allclose(model.mixture_rows.sum(axis=1), 1.0, rtol=1e-5)
 

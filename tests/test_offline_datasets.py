@@ -164,11 +164,12 @@ def given(path: Path, name: str, obs_dim: int = 11, action_dim: int = 3, n: int 
 
 def test_any_fitting_minari_dataset_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = given(tmp_path, "mine/hopper-v0")
-    given(tmp_path, "mine/hopper-v1")
+    another = given(tmp_path, "mine/hopper-v1", n=60)
     assert_same(client_datasets("HopperHard", dataset=str(tmp_path / "mine/hopper-v0"), clients=[4])[0], data)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     first, second = client_datasets("HopperHard", dataset="mine/hopper-v{client}", clients=[0, 1])
     assert_same(first, data)
+    assert_same(second, another)
     parts = client_datasets("HopperHard", dataset="mine/hopper-v0", size=25, clients=[0, 1])
     assert [len(part) for part in parts] == [25, 25]
     assert not np.array_equal(parts[0].observations, parts[1].observations)  # each client in its own order of episodes

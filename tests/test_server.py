@@ -184,5 +184,7 @@ def test_composite_merges_broadcasts():
 def test_server_imports_neither_torch_nor_gymnasium():
     import subprocess
 
-    code = "import sys, sb3_fedguide.server.ot_moe, sb3_fedguide.server.averaging; print({'torch', 'gymnasium'} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "set()"
+    imports = "import sys, sb3_fedguide.server.ot_moe, sb3_fedguide.server.averaging"
+    code = f"{imports}; print({{'torch', 'gymnasium'}} & set(sys.modules))"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert printed.strip() == "set()"

@@ -120,6 +120,7 @@ class FedGuide(FederatedPPO):
         self.dice: DiceValue | None = None
         self.dice_scale: np.ndarray | None = None  # (n_clients, 2): a and b of the calibration
         self.adaptation: HeadAdaptation | None = None
+        self.experts: np.ndarray | None = None  # what each client last received, (n_clients, n_experts, ...)
         super().__init__(policy, env, **ppo)
 
     # -- server and what crosses to it -------------------------------------------------------------------------------
@@ -151,7 +152,6 @@ class FedGuide(FederatedPPO):
         self.prior = fitted.prior
         self.heads = fitted.heads  # psi_i, (n_clients, action_dim, p + 1)
         self.score_moments = fitted.moments  # S_i of the score cost; stay with their client
-        self.experts: np.ndarray | None = None  # what each client last received, (n_clients, n_experts, ...)
         if self.adapt == "advantage":
             self.adaptation = HeadAdaptation(fitted.statistics, self.adapt_weight, self.adapt_temperature)
         if self.uses_dice:
@@ -334,9 +334,7 @@ class FedGuideA(FedGuide):
     All other parameters are those of :class:`FedGuide`.
     """
 
-    def __init__(
-        self, policy: PolicyLike, env: FederationLike | None, average_every: int = 5, **fedguide: object
-    ) -> None:
+    def __init__(self, policy: PolicyLike, env: FederationLike | None, average_every: int = 5, **fedguide: object) -> None:
         if average_every < 1:
             raise ValueError(f"average_every={average_every} must be at least 1 round")
         self.average_every = average_every

@@ -12,6 +12,7 @@ from sb3_fedguide.cli.arguments import OneLineParser
 if TYPE_CHECKING:
     from fed_envs import Family
     from sb3_fedguide.benchmark.bandit2d import MethodResult
+    from sb3_fedguide.cli.config import Config
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
 #: Trained in this order; Local is drawn as a curve only.
@@ -38,9 +39,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not 0 <= arguments.seed < 2**31:
             raise ValueError(f"--seed must lie in [0, 2^31), not {arguments.seed}")
         check_log_folder(folder)
-        _run(folder, arguments.conf_file, arguments.rounds, arguments.seed, arguments.progress)
+        configs = _configs(arguments.conf_file, arguments.rounds)
     except ValueError as error:
         parser.error(str(error))
+    try:
+        _run(folder, configs, arguments.seed, arguments.progress)
     except KeyboardInterrupt:
         print("\ninterrupted; nothing was drawn")
         return 130
@@ -48,7 +51,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _run(folder: Path, conf_file: str, rounds: int | None, seed: int, progress: bool) -> None:
+def _configs(conf_file: str, rounds: int | None) -> dict[str, Config]:
+    from fed_envs import load_family
+    from sb3_fedguide.cli.config import resolve
+
+    family, overrides = load_family("Bandit2D"), {} if rounds is None else {"n_rounds": rounds}
+    return {name: resolve(algo, family, conf_file, overrides=overrides) for name, algo in METHODS.items()}
+
+
+def _run(folder: Path, configs: dict[str, Config], seed: int, progress: bool) -> None:
     import torch as th
     from rich.console import Console
     from rich.table import Table
@@ -61,7 +72,7 @@ def _run(folder: Path, conf_file: str, rounds: int | None, seed: int, progress: 
 
     th.set_num_threads(1)
     family = load_family("Bandit2D")
-    trained = {name: _train(name, family, conf_file, rounds, seed, progress) for name in METHODS}
+    trained = {name: _train(name, config, family, seed, progress) for name, config in configs.items()}
     results = [result for _, result in trained.values()]
     guided = trained["FedGuide"][0]
     data = client_datasets(family, guided.pretraining_config.dataset_size, seed, guided.cache_dir)
@@ -81,14 +92,10 @@ def _run(folder: Path, conf_file: str, rounds: int | None, seed: int, progress: 
     console.print(f"picture {picture}", highlight=False, soft_wrap=True)
 
 
-def _train(
-    name: str, family: Family, conf_file: str, rounds: int | None, seed: int, progress: bool
-) -> tuple[FederatedPPO, MethodResult]:
+def _train(name: str, config: Config, family: Family, seed: int, progress: bool) -> tuple[FederatedPPO, MethodResult]:
     from sb3_fedguide.benchmark.bandit2d import MethodResult, PolicySnapshot, policies
-    from sb3_fedguide.cli.config import resolve
     from sb3_fedguide.cli.recorder import RunEvalCallback
 
-    config = resolve(METHODS[name], family, conf_file, overrides={} if rounds is None else {"n_rounds": rounds})
     model = config.make(family, seed=seed)
     evaluation, snapshot = RunEvalCallback(config.n_rounds, eval_freq=1), PolicySnapshot()
     total = config.n_rounds * model.rollout_size * model.n_clients

@@ -165,7 +165,7 @@ def _check_range(name: str, number: float) -> None:
     if not low <= number <= high:
         lower = "positive" if low == _OPEN else f"at least {low:g}"
         expected = lower if high == math.inf else f"between {low:g} and {high:g}"
-        raise ValueError(f"{name}={number} must be {expected}")
+        raise ValueError(f"{name}={number:g} must be {expected}")
 
 
 def _reason(problem: Any) -> str:

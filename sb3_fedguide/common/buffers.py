@@ -143,6 +143,7 @@ class FederatedRolloutBuffer:
         extras = {name: tensor[client, order] for name, tensor in self.extras.items()}
         for start in range(0, self.n_rows, batch_size):
             part = slice(start, start + batch_size)
-            yield FederatedSamples(
-                *(tensor[:, part] for tensor in tensors), extras={name: tensor[:, part] for name, tensor in extras.items()}
-            )
+            observations, actions, *others = (tensor[:, part] for tensor in tensors)
+            values, log_probs, advantages, returns = others
+            more = {name: tensor[:, part] for name, tensor in extras.items()}
+            yield FederatedSamples(observations, actions, values, log_probs, advantages, returns, more)

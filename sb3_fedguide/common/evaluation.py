@@ -66,10 +66,10 @@ def evaluate_federation(
     """
     env.seed(seed)
     env.active[:] = True
-    obs = env.reset()
+    obs: Any = env.reset()
     returns, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)
     while env.active.any():
-        obs, rewards, dones, infos = env.step(predict(obs))
+        obs, _, dones, infos = env.step(predict(obs))
         for index in np.flatnonzero(dones):
             returns[index], lengths[index] = infos[index]["episode"]["r"], infos[index]["episode"]["l"]
         env.active[dones] = False
@@ -134,9 +134,7 @@ class FederatedEvalCallback(RoundCallback):
         self.env.close()
 
     def _evaluate(self, policy: str, round: int) -> Evaluation:
-        evaluation = evaluate_federation(
-            lambda obs: self.model.predict(obs, deterministic=self.deterministic)[0], self.env
-        )
+        evaluation = evaluate_federation(lambda obs: self.model.predict(obs, deterministic=self.deterministic)[0], self.env)
         self.last[policy] = evaluation
         if self.csv_path is not None:
             with self.csv_path.open("a", newline="") as file:

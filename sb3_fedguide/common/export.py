@@ -20,7 +20,12 @@ class NormalizedObservation(BaseFeaturesExtractor):
     :param clip: bound on the normalised values
     """
 
-    def __init__(self, observation_space: spaces.Box, mean: list[float], var: list[float], epsilon: float, clip: float) -> None:
+    mean: th.Tensor
+    deviation: th.Tensor
+
+    def __init__(
+        self, observation_space: spaces.Box, mean: list[float], var: list[float], epsilon: float, clip: float
+    ) -> None:
         super().__init__(observation_space, features_dim=observation_space.shape[0])
         self.clip = clip
         self.register_buffer("mean", th.tensor(mean, dtype=th.float64))

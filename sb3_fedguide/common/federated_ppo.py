@@ -63,7 +63,8 @@ class FederatedPPO(Federation, PPO):
     """PPO for every client of a family at once; the base class of every on-policy method.
 
     One rollout and one ``train()`` is one communication round. A method adds to it by a few hooks: a server ``strategy``
-    with ``upload`` and ``receive``, :meth:`_prepare_training`, :meth:`_extra_losses` and :meth:`_transform_gradients`. Without them, N clients learn exactly as N separate SB3 PPO runs.
+    with ``upload`` and ``receive``, :meth:`_prepare_training`, :meth:`_extra_losses` and :meth:`_transform_gradients`.
+    Without them, N clients learn exactly as N separate SB3 PPO runs.
 
     Paper: https://arxiv.org/abs/1707.06347 (PPO)
 
@@ -130,7 +131,7 @@ class FederatedPPO(Federation, PPO):
         self.rollout_size = rollout_size
         super().__init__(
             policy,
-            env,
+            env,  # type: ignore[arg-type]
             learning_rate=learning_rate,
             n_steps=rollout_size // self.n_envs_per_client,
             batch_size=batch_size,
@@ -161,7 +162,11 @@ class FederatedPPO(Federation, PPO):
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         self.rollout_buffer = FederatedRolloutBuffer(
-            self.n_steps, self.n_clients, self.n_envs_per_client, self.observation_space, self.action_space  # type: ignore
+            self.n_steps,
+            self.n_clients,
+            self.n_envs_per_client,
+            self.observation_space,  # type: ignore[arg-type]
+            self.action_space,  # type: ignore[arg-type]
         )
         kwargs = {**self.policy_kwargs, "n_clients": self.n_clients, "init_seed": integer_seed(self.seed, Role.INIT)}
         self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs).to(self.device)  # type: ignore
@@ -274,7 +279,7 @@ class FederatedPPO(Federation, PPO):
             for index in np.flatnonzero(flat_dones):
                 self._end_episode(int(index), infos[index])
             raw_obs, obs, starts = next_raw, self.normalizer.normalize_obs(next_raw), dones
-        self._last_obs, self._last_episode_starts = new_raw_obs, flat_dones
+        self._last_obs, self._last_episode_starts = new_raw_obs, flat_dones  # type: ignore[assignment]
         self._finish_rollout(raw_obs, obs, dones)
         callback.update_locals(locals())
         callback.on_rollout_end()

@@ -41,6 +41,7 @@ class Federation(BaseAlgorithm):
     policy: StackedMlpPolicy  # type: ignore[assignment]
     normalizer: FederatedNormalizer
     rollout_size: int
+    gamma: float
     #: whether the broadcast policy differs from the deployed one and deserves an evaluation of its own
     shares_policy: ClassVar[bool] = False
 

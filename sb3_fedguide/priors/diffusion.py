@@ -9,7 +9,7 @@ import torch as th
 from torch.nn import functional as F
 
 from sb3_fedguide.priors.base import HeadStatistics, Prior
-from sb3_fedguide.priors.density import ddim_sample, ode_log_density, training_angle, uniform_step_angle
+from sb3_fedguide.priors.density import flow_sample, ode_log_density, training_angle, uniform_step_angle
 from sb3_fedguide.priors.trunk_network import DiffusionTrunk
 
 OBS_CLIP = 10.0  # standardised observations beyond this are as far out as it gets
@@ -34,7 +34,7 @@ class DiffusionPrior(Prior):
     :param n_draws: noise draws per row when a head is fitted
     :param max_rows: cap on rows times draws of one fit; beyond it there are fewer draws, then fewer rows
     :param n_ode_steps: default RK4 steps of :meth:`log_prob`
-    :param n_sample_steps: default DDIM steps of :meth:`sample`
+    :param n_sample_steps: default denoising steps of :meth:`sample`
     :param rng: initialises the trunk; default a fixed stream, so that every site starts from the same network
     """
 
@@ -101,6 +101,27 @@ class DiffusionPrior(Prior):
     def standardise(self, obs: th.Tensor) -> th.Tensor:
         """Raw observations to what the trunk sees."""
         return ((obs - self.obs_mean) / self.obs_std).clamp(-OBS_CLIP, OBS_CLIP)
+
+    @th.no_grad()
+    def predict_noise(
+        self, head: np.ndarray | th.Tensor, obs: th.Tensor, noisy_actions: th.Tensor, theta: th.Tensor
+    ) -> th.Tensor:
+        """``eps_hat(s, a_k, k)``; the score is ``-eps_hat / sin(theta)``.
+
+        :param head: one head ``(action_dim, p + 1)``
+        :param obs: ``(batch, obs_dim)``, raw
+        :param noisy_actions: ``(batch, action_dim)``
+        :param theta: noise angles ``(batch,)``: :func:`~sb3_fedguide.priors.density.noise_angle` of ``(k + 1) / K``
+        :return: ``(batch, action_dim)``
+        """
+        heads, single = self._check_heads(head)
+        if not single:
+            raise ValueError("predict_noise takes one head; loop over several.")
+        obs, noisy_actions = self._check_batch(obs, noisy_actions)
+        theta = th.as_tensor(theta, dtype=th.float32)
+        phi = self.trunk(self.trunk.encoder(self.standardise(obs)), noisy_actions, theta)
+        velocity = F.linear(phi, heads[0, :, :-1], heads[0, :, -1])
+        return theta.sin().unsqueeze(-1) * noisy_actions + theta.cos().unsqueeze(-1) * velocity
 
     def head_statistics(
         self,
@@ -211,7 +232,7 @@ class DiffusionPrior(Prior):
         assignment: np.ndarray | None = None,
         n_steps: int | None = None,
     ) -> th.Tensor:
-        """By DDIM: one pass of the trunk for all rows, each row with its own head."""
+        """By the probability flow: one pass of the trunk for all rows, each row with its own head."""
         heads, _ = self._check_heads(head)
         obs = th.as_tensor(obs, dtype=th.float32)
         index = th.from_numpy(self._check_assignment(assignment, len(heads), len(obs)))
@@ -230,5 +251,5 @@ class DiffusionPrior(Prior):
                 every = F.linear(phi, weight, bias).view(len(phi), len(heads), self.action_dim)
                 return every.gather(1, choice).squeeze(1)
 
-            chunks.append(ddim_sample(velocity, noise[part], steps))
+            chunks.append(flow_sample(velocity, noise[part], steps))
         return th.cat(chunks) if chunks else noise

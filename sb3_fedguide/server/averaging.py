@@ -33,9 +33,7 @@ class Averaging(Strategy):
     :param average_until: not after later rounds than this; ``None`` for no end
     """
 
-    def __init__(
-        self, prefixes: tuple[str, ...] = ("",), average_every: int = 1, average_until: int | None = None
-    ) -> None:
+    def __init__(self, prefixes: tuple[str, ...] = ("",), average_every: int = 1, average_until: int | None = None) -> None:
         super().__init__()
         self.prefixes = prefixes
         self.average_every = average_every
