@@ -81,7 +81,8 @@ def test_average_of_heads_is_average_of_noise_predictions(random_prior):
     theta = th.tensor(training_angle(RNG(0).random(len(obs))))
     averaged = prior.predict_noise(np.tensordot(weights, heads, 1), th.tensor(obs), th.tensor(actions), theta)
     each = [prior.predict_noise(head, th.tensor(obs), th.tensor(actions), theta) for head in heads]
-    th.testing.assert_close(averaged, sum(float(w) * eps for w, eps in zip(weights, each, strict=True)), atol=2e-6, rtol=1e-5)
+    expected = sum(float(w) * eps for w, eps in zip(weights, each, strict=True))
+    assert (averaged - expected).abs().max() < 1e-6 * max(float(eps.abs().max()) for eps in each)
 
 
 def test_score_cost_is_the_monte_carlo_mean(random_prior):
@@ -91,7 +92,7 @@ def test_score_cost_is_the_monte_carlo_mean(random_prior):
     cost = score_cost(heads[0], heads, prior.feature_moment(obs, actions, RNG(0)))
     assert cost[0] == 0.0
     # Apart from the closed form: independent draws, scores from the noise predictions.
-    rng, n = RNG(1), 400_000
+    rng, n = RNG(1), 200_000
     rows = rng.integers(20, size=n)
     theta = uniform_step_angle((rng.permutation(n) + rng.random(n)) / n)
     noise = rng.standard_normal((n, 2))
@@ -204,7 +205,7 @@ def test_observations_are_standardised_inside(random_prior):
 @pytest.mark.parametrize("action_dim", [1, 2])
 def test_density_integrates_to_one(action_dim, request):
     prior, heads = request.getfixturevalue(("one", "two")[action_dim - 1])
-    n = 400 if action_dim == 1 else 90
+    n = 400 if action_dim == 1 else 64
     edges = np.linspace(-2.5, 2.5, n)
     grid = np.stack(np.meshgrid(*[edges] * action_dim), axis=-1).reshape(-1, action_dim).astype(np.float32)
     for obs in ([0.0, 0.0], [0.8, -0.5]):

@@ -216,6 +216,8 @@ def federated_trunk(
     if average_every < 1:
         raise ValueError(f"average_every must be at least 1, got {average_every}.")
     prior = copy.deepcopy(prior)
+    for dataset in datasets:
+        prior.check_data(dataset.observations, dataset.actions, None)
     moments = [observation_moments(dataset.observations) for dataset in datasets]
     mean, std = merge_moments(moments)
     prior.set_observation_moments(mean, std)

@@ -93,7 +93,7 @@ def ode_log_density(
 
 
 def sample_angles(n_steps: int) -> np.ndarray:
-    """Angles of the ``n_steps`` evaluations of :func:`flow_sample`, falling from ``t = 1``, equally spaced in their cube root."""
+    """Angles of the ``n_steps`` evaluations of :func:`flow_sample`, falling from ``t = 1`` in equal steps of the cube root."""
     return np.linspace(THETA_MAX ** (1 / 3), THETA_MIN ** (1 / 3), n_steps + 1)[:-1] ** 3
 
 
@@ -103,9 +103,9 @@ def flow_sample(
     """Sample by the probability flow from standard normal ``noise`` at ``t = 1``; one evaluation per step.
 
     A DDIM step (Song et al. 2021, eta = 0) holds the predicted clean action ``x_0 = alpha x - sigma v`` fixed. With
-    ``second_order`` it is extrapolated from the last two predictions (DPM-Solver++ 2M, Lu et al. 2022), at the same price: with
-    ten steps the Kolmogorov-Smirnov distance to one-dimensional mixtures falls from 0.04 to 0.01. The first step and the last,
-    to the clean action, are plain DDIM.
+    ``second_order`` it is extrapolated from the last two predictions (DPM-Solver++ 2M, Lu et al. 2022), at the same price:
+    with ten steps the Kolmogorov-Smirnov distance to one-dimensional mixtures falls from 0.04 to 0.01. The first step and
+    the last, to the clean action, are plain DDIM.
 
     :param velocity: ``(x, theta) -> v``
     :param noise: ``(..., d)``
