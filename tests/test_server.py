@@ -19,7 +19,7 @@ def random_cost(n, m, seed=0):
 @pytest.mark.parametrize(("n", "m"), [(8, 8), (10, 8), (4, 7), (1, 3)])
 @pytest.mark.parametrize("eta", [0.05, 0.5])
 def test_plan_has_its_marginals(n, m, eta):
-    plan, error = sinkhorn_plan(random_cost(n, m), eta)
+    plan, error, _ = sinkhorn_plan(random_cost(n, m), eta)
     assert (plan >= 0).all() and error <= 1e-4 / n
     np.testing.assert_allclose(plan.sum(1), 1 / n, atol=1e-6)
     np.testing.assert_allclose(plan.sum(0), 1 / m, atol=1e-6)
@@ -43,6 +43,14 @@ def test_plan_equals_plain_sinkhorn_iterations():
     np.testing.assert_allclose(sinkhorn_plan(cost, eta)[0], u[:, None] * kernel * v, atol=1e-8)
 
 
+def test_warm_start_gives_the_same_plan_sooner():
+    cost = random_cost(8, 8)
+    first = sinkhorn_plan(cost, 0.05)
+    nearby = cost + 0.01 * random_cost(8, 8, seed=1)
+    cold, warm = sinkhorn_plan(nearby, 0.05), sinkhorn_plan(nearby, 0.05, start=first.potentials)
+    np.testing.assert_allclose(warm.mass, cold.mass, atol=1e-5)
+
+
 def test_plan_refuses_broken_costs_and_unreached_marginals():
     with pytest.raises(ValueError, match="finite"):
         sinkhorn_plan(np.array([[np.nan, 1.0]]), 0.05)
@@ -54,7 +62,7 @@ def test_cost_scaling():
     cost = np.array([[0.0, 2.0], [4.0, 100.0]])
     assert scale_cost(cost, "max").max() == 1.0
     np.testing.assert_allclose(scale_cost(cost, "median"), cost / 4.0)
-    plan, _ = sinkhorn_plan(scale_cost(np.zeros((3, 3)), "max"), 0.05)
+    plan, _, _ = sinkhorn_plan(scale_cost(np.zeros((3, 3)), "max"), 0.05)
     np.testing.assert_allclose(plan, 1 / 9)
 
 

@@ -150,6 +150,7 @@ class FedGuide(FederatedPPO):
     def _pretrain(self, stage: Pretraining) -> None:
         fitted = stage.prior()
         self.prior = fitted.prior
+        self.pretraining_bytes = (fitted.bytes_up * self.n_clients, fitted.bytes_down * self.n_clients)
         self.heads = fitted.heads  # psi_i, (n_clients, action_dim, p + 1)
         self.score_moments = fitted.moments  # S_i of the score cost; stay with their client
         if self.adapt == "advantage":

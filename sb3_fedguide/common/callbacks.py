@@ -62,6 +62,8 @@ class ExchangeCallback(RoundCallback):
         self.bytes_down = 0
 
     def _on_training_start(self) -> None:
+        if self.model.round == 0:
+            self.bytes_up, self.bytes_down = self.model.pretraining_bytes
         strategy = self.model.strategy
         while strategy is not None and strategy.needs_setup:
             self._exchange()

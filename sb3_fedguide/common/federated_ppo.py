@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypedDict, TypeVar
@@ -129,29 +130,32 @@ class FederatedPPO(Federation, PPO):
         self._init_federation(env, normalize, bc_weight, pretraining, cache_dir)
         _check_sizes(rollout_size, batch_size, self.n_envs_per_client)
         self.rollout_size = rollout_size
-        super().__init__(
-            policy,
-            env,  # type: ignore[arg-type]
-            learning_rate=learning_rate,
-            n_steps=rollout_size // self.n_envs_per_client,
-            batch_size=batch_size,
-            n_epochs=n_epochs,
-            gamma=gamma,
-            gae_lambda=gae_lambda,
-            clip_range=clip_range,
-            clip_range_vf=clip_range_vf,
-            normalize_advantage=normalize_advantage,
-            ent_coef=ent_coef,
-            vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            seed=int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else seed,
-            device=device,
-            _init_setup_model=False,
-        )
+        with warnings.catch_warnings():
+            # SB3 takes the clients' rollouts for one and compares its size with a client's minibatch.
+            warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
+            super().__init__(
+                policy,
+                env,  # type: ignore[arg-type]
+                learning_rate=learning_rate,
+                n_steps=rollout_size // self.n_envs_per_client,
+                batch_size=batch_size,
+                n_epochs=n_epochs,
+                gamma=gamma,
+                gae_lambda=gae_lambda,
+                clip_range=clip_range,
+                clip_range_vf=clip_range_vf,
+                normalize_advantage=normalize_advantage,
+                ent_coef=ent_coef,
+                vf_coef=vf_coef,
+                max_grad_norm=max_grad_norm,
+                stats_window_size=stats_window_size,
+                tensorboard_log=tensorboard_log,
+                policy_kwargs=policy_kwargs,
+                verbose=verbose,
+                seed=int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else seed,
+                device=device,
+                _init_setup_model=False,
+            )
         if _init_setup_model:
             self._setup_model()
 
@@ -215,6 +219,7 @@ class FederatedPPO(Federation, PPO):
     ) -> SelfFederatedPPO:
         """Train for ``total_timesteps`` steps of all clients together, rounded up to whole rounds; otherwise as in SB3."""
         self.pretrain(progress_bar)
+        reset = reset_num_timesteps or self._last_obs is None
         # SB3 logs before train() and offers no event after it, so the loop is our own: rollout, train, exchange, log.
         total_timesteps, callbacks = self._setup_learn(
             total_timesteps,
@@ -224,7 +229,7 @@ class FederatedPPO(Federation, PPO):
         )
         if reset_num_timesteps:
             self.round = 0
-        self._begin_learning(environments_were_reset=reset_num_timesteps)
+        self._begin_learning(environments_were_reset=reset)
         rounds = list(round_callbacks(callbacks))
         callbacks.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:

@@ -65,6 +65,8 @@ class Federation(BaseAlgorithm):
         self.cache_dir = cache_dir
         self.round = 0
         self.pretrained = False
+        #: bytes that all clients together sent and received in the offline stage
+        self.pretraining_bytes = (0, 0)
         self.strategy: Strategy | None = None
         self._streams: dict[Role, list[np.random.Generator]] = {}
 

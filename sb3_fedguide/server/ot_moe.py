@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -19,15 +19,32 @@ for _backend in ("PYTORCH", "JAX", "CUPY", "TENSORFLOW"):  # importing POT with 
     os.environ.setdefault(f"POT_BACKEND_DISABLE_{_backend}", "1")
 
 
+class TransportPlan(NamedTuple):
+    """An entropic transport plan.
+
+    :param mass: ``(n_clients, n_experts)``
+    :param marginal_error: the largest deviation of a row or column sum from its marginal
+    :param potentials: the logarithms of the scaling vectors, from which the next solve can start
+    """
+
+    mass: np.ndarray
+    marginal_error: float
+    potentials: tuple[np.ndarray, np.ndarray]
+
+
 def sinkhorn_plan(
-    cost: np.ndarray, eta: float, row_marginal: np.ndarray | None = None, column_marginal: np.ndarray | None = None
-) -> tuple[np.ndarray, float]:
+    cost: np.ndarray,
+    eta: float,
+    row_marginal: np.ndarray | None = None,
+    column_marginal: np.ndarray | None = None,
+    start: tuple[np.ndarray, np.ndarray] | None = None,
+) -> TransportPlan:
     """Entropic optimal transport plan (paper, Eq. ot-plan) by POT's log-domain Sinkhorn.
 
     :param cost: ``(n_clients, n_experts)``, finite, nonnegative, already scaled
     :param eta: entropic regularisation
     :param row_marginal: mu, uniform by default; ``column_marginal``, nu, alike
-    :return: the plan ``(n_clients, n_experts)`` and its largest marginal error
+    :param start: potentials of a similar problem, from which few iterations are left
     :raises ValueError: for costs that are not finite
     :raises RuntimeError: where the marginal error stays above ``1e-4 / n_clients``
     """
@@ -39,13 +56,22 @@ def sinkhorn_plan(
     n, m = cost.shape
     mu = np.full(n, 1 / n) if row_marginal is None else np.asarray(row_marginal, dtype=np.float64)
     nu = np.full(m, 1 / m) if column_marginal is None else np.asarray(column_marginal, dtype=np.float64)
-    plan, _ = ot.sinkhorn(
-        mu, nu, cost, reg=eta, method="sinkhorn_log", numItermax=10_000, stopThr=min(1e-7, 1e-5 / n), log=True, warn=False
+    mass, log = ot.sinkhorn(
+        mu,
+        nu,
+        cost,
+        reg=eta,
+        method="sinkhorn_log",
+        numItermax=10_000,
+        stopThr=1e-5 / n,
+        log=True,
+        warn=False,
+        warmstart=start,
     )
-    error = float(max(np.abs(plan.sum(1) - mu).max(), np.abs(plan.sum(0) - nu).max()))
+    error = float(max(np.abs(mass.sum(1) - mu).max(), np.abs(mass.sum(0) - nu).max()))
     if not error <= 1e-4 / n:
         raise RuntimeError(f"Sinkhorn left a marginal error of {error:.1e} at eta={eta}; use a larger eta")
-    return plan, error
+    return TransportPlan(mass, error, (log["log_u"], log["log_v"]))
 
 
 def scale_cost(cost: np.ndarray, scaling: Literal["max", "median"]) -> np.ndarray:
@@ -115,6 +141,7 @@ class OTMoE(Strategy):
         self.experts: np.ndarray | None = None
         self.plan: np.ndarray | None = None
         self.rows: dict[int, np.ndarray] = {}
+        self._potentials: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def needs_setup(self) -> bool:
@@ -129,7 +156,8 @@ class OTMoE(Strategy):
                 return {client: {EXPERTS: self.experts.copy()} for client in clients}
         raw = self._costs(heads, uploads, clients)
         cost = scale_cost(raw, self.cost_scaling)
-        self.plan, error = sinkhorn_plan(cost, self.eta)
+        start = self._potentials if self._potentials is not None and len(self._potentials[0]) == len(clients) else None
+        self.plan, error, self._potentials = sinkhorn_plan(cost, self.eta, start=start)
         rows = self.plan / self.plan.sum(axis=1, keepdims=True)
         self.rows.update(zip(clients, rows.astype(np.float32), strict=True))
         if round > 0:  # the first plan routes to the seeded experts as they are
