@@ -123,7 +123,7 @@ class TrunkTraining:
         rngs: Sequence[np.random.Generator],
         n_updates: int,
         batch_size: int = 128,
-        learning_rate: float = 3e-3,
+        learning_rate: float = 5e-3,
     ) -> None:
         if len(datasets) == 0 or len(rngs) != len(datasets):
             raise ValueError(f"Trunk training needs one random generator per dataset, got {len(rngs)} for {len(datasets)}.")
@@ -198,7 +198,7 @@ def federated_trunk(
     n_updates: int = 5000,
     average_every: int = 50,
     batch_size: int = 128,
-    learning_rate: float = 3e-3,
+    learning_rate: float = 5e-3,
     progress: StepProgress | None = None,
 ) -> TrunkResult:
     """Pretrain the trunk of ``prior`` by FedAvg over the clients, all in this process.
