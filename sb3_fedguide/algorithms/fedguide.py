@@ -76,7 +76,7 @@ class FedGuide(FederatedPPO):
         prior_horizon: int = 50,
         prior_loss: Literal["snis", "sample"] = "snis",
         prior_states: int | None = 512,
-        density_steps: int = 4,
+        density_steps: int = 6,
         sampling_steps: int = 10,
         beta: float | Schedule | Literal["auto"] = 0.5,
         critic_target: Literal["online", "blend"] = "online",

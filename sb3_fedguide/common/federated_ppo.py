@@ -24,6 +24,7 @@ from sb3_fedguide.common.federation import Federation, FederationLike, PolicyLik
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.policies import StackedMlpPolicy
 from sb3_fedguide.common.seeding import Role, integer_seed
+from sb3_fedguide.common.stacked import clip_grad_norm_per_client
 from sb3_fedguide.common.training_log import RoundStatistics, record_training
 from sb3_fedguide.offline.pretraining import PretrainingConfig
 
@@ -389,16 +390,6 @@ class FederatedPPO(Federation, PPO):
             self._n_updates += 1
         self._finish_training()
         record_training(self, statistics, {"clip_range": self.clip_range, "clip_range_vf": self.clip_range_vf})
-
-
-def clip_grad_norm_per_client(parameters: Sequence[th.nn.Parameter], max_norm: float) -> th.Tensor:
-    """``clip_grad_norm_`` for each client by itself; returns the norms before clipping, ``(n_clients,)``."""
-    grads = [parameter.grad for parameter in parameters if parameter.grad is not None]
-    norms = th.linalg.vector_norm(th.stack([th.linalg.vector_norm(g.flatten(1), dim=1) for g in grads], dim=1), dim=1)
-    scale = th.clamp(max_norm / (norms + 1e-6), max=1.0)
-    for grad in grads:
-        grad.mul_(scale.view(-1, *([1] * (grad.dim() - 1))))
-    return norms
 
 
 def _check_sizes(rollout_size: int, batch_size: int, n_envs_per_client: int) -> None:

@@ -5,7 +5,7 @@ One batched matrix product serves all clients, and client k's slice of the state
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch as th
 from torch import nn
@@ -63,3 +63,13 @@ def stack_tensor(tensor: th.Tensor, n_clients: int) -> th.Tensor:
 def client_state(state: Mapping[str, th.Tensor], index: int) -> dict[str, th.Tensor]:
     """Client ``index``'s part of a stacked state dict, copied: the state dict of an ordinary, unstacked network."""
     return {name: tensor[index].detach().clone() for name, tensor in state.items()}
+
+
+def clip_grad_norm_per_client(parameters: Sequence[th.nn.Parameter], max_norm: float) -> th.Tensor:
+    """``clip_grad_norm_`` for each client by itself; returns the norms before clipping, ``(n_clients,)``."""
+    grads = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    norms = th.linalg.vector_norm(th.stack([th.linalg.vector_norm(g.flatten(1), dim=1) for g in grads], dim=1), dim=1)
+    scale = th.clamp(max_norm / (norms + 1e-6), max=1.0)
+    for grad in grads:
+        grad.mul_(scale.view(-1, *([1] * (grad.dim() - 1))))
+    return norms

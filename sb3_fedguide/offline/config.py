@@ -44,7 +44,7 @@ class PretrainingConfig(BaseModel):
     prior_updates: Count = 5000
     prior_epochs: Count | None = None
     prior_batch_size: Count = 128
-    prior_learning_rate: Positive = 3e-3
+    prior_learning_rate: Positive = 5e-3
     prior_width: Count = 64
     prior_average_every: Count = 50
 
