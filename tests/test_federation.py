@@ -32,6 +32,9 @@ def test_client_is_an_ordinary_ppo_with_the_same_actions(point_envs, small, norm
     loaded = PPO.load(tmp_path / "client", env=point_envs(3)[2]())
     np.testing.assert_allclose(loaded.predict(obs[4:], deterministic=True)[0], ours[4:], atol=1e-6)
     loaded.learn(1)  # and it can be trained further
+    model.export(2, tmp_path / "client.pt2")
+    exported = th.export.load(tmp_path / "client.pt2").module()(th.as_tensor(obs[4:]))
+    np.testing.assert_allclose(exported.numpy(), ours[4:], atol=1e-6)
 
 
 @pytest.mark.parametrize("normalize", [False, True])

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
@@ -34,6 +36,36 @@ class NormalizedObservation(BaseFeaturesExtractor):
     def forward(self, observations: th.Tensor) -> th.Tensor:
         scaled = (observations - self.mean) / self.deviation
         return th.clamp(scaled, -self.clip, self.clip).to(th.float32)
+
+
+class DeployedPolicy(nn.Module):
+    """A client's deterministic policy from raw observations to executed actions, free of SB3 and of this package.
+
+    ``(batch, obs_dim)`` float32 to ``(batch, action_dim)`` float32, clipped to the action space.
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(self, model: PPO) -> None:
+        super().__init__()
+        self.features = model.policy.features_extractor
+        self.policy_net = model.policy.mlp_extractor.policy_net
+        self.action_net = model.policy.action_net
+        self.register_buffer("low", th.as_tensor(model.action_space.low))  # type: ignore[attr-defined]
+        self.register_buffer("high", th.as_tensor(model.action_space.high))  # type: ignore[attr-defined]
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        actions = self.action_net(self.policy_net(self.features(observations)))
+        return th.minimum(th.maximum(actions, self.low), self.high)
+
+
+def export_client(federation: Federation, index: int, path: str | Path) -> None:
+    """Write the policy of the client at position ``index`` as a ``torch.export`` program."""
+    policy = DeployedPolicy(client_model(federation, index)).eval().requires_grad_(False)
+    example = th.zeros(2, federation.observation_space.shape[0])  # type: ignore[index]
+    batch = {0: th.export.Dim("batch")}
+    th.export.save(th.export.export(policy, (example,), dynamic_shapes=(batch,)), path)
 
 
 def client_model(federation: Federation, index: int) -> PPO:

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundProgressCallback
-from sb3_fedguide.common.export import client_model
+from sb3_fedguide.common.export import client_model, export_client
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.policies import StackedMlpPolicy
 from sb3_fedguide.common.seeding import Role, stream
@@ -217,9 +217,21 @@ class Federation(BaseAlgorithm):
 
         :raises ValueError: for a client that does not live here
         """
+        return client_model(self, self._position(client_id))
+
+    def export(self, client_id: int, path: str | Path) -> None:
+        """Write client ``client_id``'s deterministic policy as a ``.pt2`` file: raw observations to executed actions.
+
+        ``torch.export.load(path).module()`` runs it where neither this package nor Stable-Baselines3 is installed.
+
+        :raises ValueError: for a client that does not live here
+        """
+        export_client(self, self._position(client_id), path)
+
+    def _position(self, client_id: int) -> int:
         if client_id not in self.client_ids:
             raise ValueError(f"no client {client_id} here; this federation holds the clients {self.client_ids}")
-        return client_model(self, self.client_ids.index(client_id))
+        return self.client_ids.index(client_id)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "normalizer", "episode_infos"]
