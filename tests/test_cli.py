@@ -35,8 +35,6 @@ def prepared(*argv: str):
     return prepare(arguments, find_family(arguments), "")
 
 
-# -- wrong input ----------------------------------------------------------------------------------------------------------
-
 WRONG = {
     "--algo fedgiude --env Bandit2D": "Did you mean 'fedguide'",
     "--algo FedGuide --env Bandit2D": "Did you mean 'fedguide'",
@@ -138,9 +136,6 @@ def test_neither_help_nor_a_mistyped_name_waits_for_pytorch(arguments):
     )
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
     assert f"HEAVY [] {0 if arguments == '--help' else 2}" in result.stdout
-
-
-# -- a run ----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -249,9 +244,6 @@ def test_an_interrupted_run_keeps_what_there_is(tmp_path, monkeypatch, capsys):
     summary = json.loads((folder / "summary.json").read_text())
     assert not summary["finished"] and summary["rounds_done"] == 2 and len(summary["deployed"]["curve"]) == 2
     assert summary["bytes_up"] > 0 and (folder / "model.zip").exists()
-
-
-# -- what is asked for reaches the run --------------------------------------------------------------------------------------
 
 
 def test_a_users_metadata_reaches_training_and_evaluation(tmp_path):

@@ -41,9 +41,6 @@ def hopper():
 ROUND = 2 * 64
 
 
-# -- losses ------------------------------------------------------------------------------------------------------------
-
-
 def test_gaussian_closed_forms_equal_torch_distributions():
     generator = th.Generator().manual_seed(0)
     mean_p, mean_q, actions = (th.randn(2, 5, 3, generator=generator) for _ in range(3))
@@ -134,9 +131,6 @@ def test_prior_weight_falls_linearly_from_the_first_round(tiny):
     assert [model.prior_weight(h) for h in (0, 25, 50, 80)] == [0.5, 0.25, 0.0, 0.0]
 
 
-# -- baseline ----------------------------------------------------------------------------------------------------------
-
-
 def test_beta_one_is_the_online_critic_and_blend_is_in_between(tiny):
     model = FedGuide("MlpPolicy", hopper(), beta=1.0, **{**tiny, "rollout_size": 128})
     model.learn(2 * 128)
@@ -177,9 +171,6 @@ def test_optimal_blend_minimises_the_variance():
     np.testing.assert_allclose(beta, grid[np.argmin(variances, axis=0)], atol=0.011)
     np.testing.assert_allclose(optimal_blend(returns, online, online + 1.0), 1.0)
     assert (explained_variances(online, online) == 1.0).all()
-
-
-# -- exchange ----------------------------------------------------------------------------------------------------------
 
 
 def test_only_heads_and_cost_rows_leave_a_client(tiny):
@@ -229,9 +220,6 @@ def test_adaptation_moves_heads_and_none_does_not(tiny):
     np.testing.assert_allclose(zero.heads, before, atol=1e-4)
 
 
-# -- identities --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("normalize", [False, True])
 def test_fedguide_p_without_weights_is_local(tiny, normalize):
     args = {**tiny, "normalize": normalize, "bc_weight": 0.3}
@@ -272,9 +260,6 @@ def test_behaviour_cloning_weight_blends_from_one_initial_network(tiny):
         th.testing.assert_close(weights[0.5][name], middle)
         moved = not th.equal(weights[0.0][name], weights[1.0][name])
         assert moved == (name.startswith(ACTOR_PREFIXES) and name != "log_std"), name
-
-
-# -- files -------------------------------------------------------------------------------------------------------------
 
 
 def test_save_load_and_go_on(tiny, tmp_path):

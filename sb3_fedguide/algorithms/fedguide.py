@@ -123,8 +123,6 @@ class FedGuide(FederatedPPO):
         self.experts: np.ndarray | None = None  # what each client last received, (n_clients, n_experts, ...)
         super().__init__(policy, env, **ppo)
 
-    # -- server and what crosses to it -------------------------------------------------------------------------------
-
     def _make_strategy(self) -> Strategy:
         assert self.seed is not None
         n_experts = self.n_experts or self.n_clients
@@ -145,8 +143,6 @@ class FedGuide(FederatedPPO):
         if MIXTURE_ROW in broadcast:
             self.mixture_rows[index] = broadcast[MIXTURE_ROW]
 
-    # -- offline stage -----------------------------------------------------------------------------------------------
-
     def _pretrain(self, stage: Pretraining) -> None:
         fitted = stage.prior()
         self.prior = fitted.prior
@@ -157,8 +153,6 @@ class FedGuide(FederatedPPO):
             self.adaptation = HeadAdaptation(fitted.statistics, self.adapt_weight, self.adapt_temperature)
         if self.uses_dice:
             self.dice = stage.dice()
-
-    # -- advantages (paper, section "DICE value baseline") -----------------------------------------------------------
 
     def _compute_advantages(
         self, last_values: np.ndarray, truncation_values: np.ndarray, last_raw_obs: np.ndarray, dones: np.ndarray
@@ -223,8 +217,6 @@ class FedGuide(FederatedPPO):
             return optimal_blend(returns, online, dice).astype(np.float32)
         beta = self.beta(self._current_progress_remaining) if callable(self.beta) else self.beta
         return np.full(self.n_clients, beta, dtype=np.float32)
-
-    # -- losses (paper, Eq. client-objective) ------------------------------------------------------------------------
 
     def prior_weight(self, round: int) -> float:
         """lambda_2(h), counted from h = 0."""
@@ -303,8 +295,6 @@ class FedGuide(FederatedPPO):
             prior_log_prob = gaussian.log_prob(mean, self.policy.log_std, data.extras["prior_actions"])
             losses["prior_loss"] = -self._prior_weight * prior_log_prob.mean(dim=1)
         return losses
-
-    # -- adaptation of the head --------------------------------------------------------------------------------------
 
     def _finish_training(self) -> None:
         if self.adaptation is None:

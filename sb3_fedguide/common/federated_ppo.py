@@ -160,8 +160,6 @@ class FederatedPPO(Federation, PPO):
         if _init_setup_model:
             self._setup_model()
 
-    # -- set-up ------------------------------------------------------------------------------------------------------
-
     def _setup_model(self) -> None:
         assert self.seed is not None
         self._setup_lr_schedule()
@@ -188,8 +186,6 @@ class FederatedPPO(Federation, PPO):
         if self.strategy is None:
             self.strategy = self._make_strategy()
 
-    # -- what a method defines ---------------------------------------------------------------------------------------
-
     def _prepare_training(self) -> None:
         """After the rollout, before the first minibatch: compute what the extra losses need, once per round."""
 
@@ -206,8 +202,6 @@ class FederatedPPO(Federation, PPO):
 
     def _transform_gradients(self, data: FederatedSamples) -> None:
         """Change ``parameter.grad`` in place, before clipping."""
-
-    # -- one round ---------------------------------------------------------------------------------------------------
 
     def learn(
         self: SelfFederatedPPO,

@@ -89,8 +89,6 @@ class Federation(BaseAlgorithm):
             self._streams[role] = [stream(self.seed, role, client) for client in self.client_ids]
         return self._streams[role]
 
-    # -- what a method defines ---------------------------------------------------------------------------------------
-
     def _make_strategy(self) -> Strategy | None:
         """The server's side of this method; ``None`` where nothing is exchanged."""
         return None
@@ -104,8 +102,6 @@ class Federation(BaseAlgorithm):
 
     def _pretrain(self, stage: Pretraining) -> None:
         """A method's own part of the offline stage."""
-
-    # -- offline stage -----------------------------------------------------------------------------------------------
 
     def pretrain(self, progress_bar: bool = False) -> None:
         """The offline stage: behaviour cloning and whatever the method needs; results are cached. Runs at most once.
@@ -143,8 +139,6 @@ class Federation(BaseAlgorithm):
         with th.no_grad():
             for name, tensor in cloned.items():
                 self.policy.actor_parameter(name).lerp_(tensor.to(self.device), self.bc_weight)
-
-    # -- rounds ------------------------------------------------------------------------------------------------------
 
     def _round_callbacks(self, callback: MaybeCallback, total_timesteps: int, progress_bar: bool) -> CallbackList:
         """The exchange first, then the user's callbacks, which see its result, then the progress bar."""
@@ -188,8 +182,6 @@ class Federation(BaseAlgorithm):
     def record_client(self, client_id: int, key: str, value: float) -> None:
         """Log one client's value; kept off the terminal, where long keys collide and eight clients drown the rest."""
         self.logger.record(f"client_{client_id}/{key}", value, exclude=("stdout", "log"))
-
-    # -- use ---------------------------------------------------------------------------------------------------------
 
     def predict(  # type: ignore[override]
         self,
