@@ -113,7 +113,6 @@ def test_rollout_advantages_equal_sb3_buffer(point_envs, small, n_envs):
     model.learn(2 * model.rollout_size)
     buffer = model.rollout_buffer
     assert buffer.truncations, "the rollout must contain truncated episodes for this to test anything"
-    assert (buffer.episode_starts[1:].sum() > len(buffer.truncations)) or True
     flat = (model.n_steps, 2 * n_envs)
     theirs = RolloutBuffer(*flat[:1], model.observation_space, model.action_space, "cpu", 0.95, 0.99, n_envs=flat[1])
     theirs.rewards = buffer.bootstrapped_rewards(0.99, model._truncation_values()).reshape(flat)
