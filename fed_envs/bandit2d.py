@@ -9,11 +9,12 @@ import numpy as np
 from gymnasium import spaces
 
 from fed_envs.metadata import BANDIT2D_PEAKS, Bandit2DClient, Family
-from fed_envs.world import Batch, ClientEnv, Runner, run_here
+from fed_envs.world import Batch, ClientEnv, Runner, ScriptedPolicy, run_here
 
 PEAKS = np.array(BANDIT2D_PEAKS)  # (4, 2)
 SIGMA = 0.2  # width of the reward modes
 ACTION_LIMIT = 1.5
+DATA_RADIUS = 0.3
 
 
 def peak_weights(client: Bandit2DClient) -> np.ndarray:
@@ -97,6 +98,20 @@ class Bandit2DEnv(ClientEnv[Bandit2DClient]):
         self.observation_space = spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (2,), np.float32)
         self.action_space = spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (2,), np.float32)
         self._start()
+
+    @classmethod
+    def scripted_policy(cls, family: Family, client: int) -> ScriptedPolicy:
+        """Uniform within radius 0.3 of the client's own peak, as in the paper."""
+        own = family.client(client)
+        assert isinstance(own, Bandit2DClient)
+        peak = np.asarray(own.peak)
+
+        def around_peak(observations: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+            radius = DATA_RADIUS * np.sqrt(rng.random(len(observations)))
+            angle = 2.0 * np.pi * rng.random(len(observations))
+            return (peak + radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])).astype(np.float32)
+
+        return around_peak
 
     def _reset(self) -> tuple[np.ndarray, dict[str, Any]]:
         return np.zeros(2, dtype=np.float32), {}

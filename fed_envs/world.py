@@ -20,6 +20,9 @@ from fed_envs.metadata import Client, Family, describe, load_family, parse_famil
 EnvT = TypeVar("EnvT", bound="ClientEnv")
 ClientT = TypeVar("ClientT", bound=Client)
 
+#: Actions ``(n, action_dim)`` float32 for observations ``(n, obs_dim)`` and a generator.
+ScriptedPolicy = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+
 #: Runs a function that consumes an iterator of rows, perhaps in several threads that share the iterator.
 Runner = Callable[[Callable[[Iterator[int]], None], Sequence[int]], None]
 
@@ -76,6 +79,8 @@ class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], Generic[ClientT]):
 
     world: ClassVar[str]
     batch_class: ClassVar[type[Batch[Any]]]
+    #: raised whenever the scripted policy changes, so that old data are not taken for new ones
+    script_version: ClassVar[int] = 1
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own interface)
     observation_space: gymnasium.spaces.Box
     action_space: gymnasium.spaces.Box
@@ -102,6 +107,11 @@ class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], Generic[ClientT]):
             modes = ", ".join(self.metadata["render_modes"]) or "nothing"
             raise ValueError(f"{self.family.name} renders {modes}, not {self.render_mode!r}")
         self._batch: Batch[Any] = self.batch_class([self])
+
+    @classmethod
+    def scripted_policy(cls, family: Family, client: int) -> ScriptedPolicy | None:
+        """A behaviour to make a client's offline data with, strictly inside the action bounds, where the world knows one."""
+        return None
 
     @abstractmethod
     def _reset(self) -> tuple[np.ndarray, dict[str, Any]]:

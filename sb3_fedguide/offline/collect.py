@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any
 
@@ -10,20 +9,19 @@ import gymnasium as gym
 import numpy as np
 
 from fed_envs import Family, FederatedVecEnv
+from fed_envs.registration import environment_class
+from fed_envs.world import ScriptedPolicy
 from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.behavior import BehaviorPolicy, behavior_policy
 from sb3_fedguide.offline.data import OfflineData
 
-__all__ = ["DATA_VERSION", "collect", "default_size", "source_key"]
+__all__ = ["DATA_VERSION", "behavior_name", "collect", "default_size", "source_key"]
 
 DATA_VERSION = 1
 """Raised whenever the same inputs give other data, so that old cache entries are not taken for new ones."""
 
 N_COPIES = 8
-BANDIT_RADIUS = 0.3
 DEFAULT_SIZES = {"bandit2d": 1_000}
-
-ActionSource = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 
 def default_size(family: Family) -> int:
@@ -33,8 +31,10 @@ def default_size(family: Family) -> int:
 
 def source_key(family: Family, client: int, policy: BehaviorPolicy | None = None) -> dict[str, Any]:
     """Everything but size and seed that the data of one client depend on; nothing of the other clients is in it."""
-    source: dict[str, Any] = {"radius": BANDIT_RADIUS}
-    if family.world != "bandit2d":
+    world = environment_class(family.world)
+    if policy is None and world.scripted_policy(family, client) is not None:
+        source: dict[str, Any] = {"script_version": world.script_version}
+    else:
         source = {"policy": (policy or behavior_policy(family.backbone)).content_hash}
     return {
         "data_version": DATA_VERSION,
@@ -48,13 +48,18 @@ def source_key(family: Family, client: int, policy: BehaviorPolicy | None = None
     }
 
 
+def behavior_name(family: Family, client: int, policy: BehaviorPolicy | None = None) -> str:
+    """What acts in a client's data, for people."""
+    scripted = policy is None and environment_class(family.world).scripted_policy(family, client) is not None
+    return f"scripted policy of {family.backbone}" if scripted else "squashed PPO, medium"
+
+
 def collect(
     family: Family, client: int, size: int, seed: int, policy: BehaviorPolicy | None = None
 ) -> tuple[OfflineData, gym.spaces.Box, gym.spaces.Box]:
     """Roll out a client's behaviour in its own MDP.
 
-    Bandit2D's actions are uniform within radius 0.3 of the client's own peak, as in the paper; everywhere else the
-    backbone's shipped policy acts. Stored actions are those that the environment was given, strictly inside the bounds.
+    The world's scripted policy acts where it has one, the backbone's shipped policy elsewhere. Stored actions are those that the environment was given, strictly inside the bounds.
 
     :param size: rows
     :param seed: with ``client`` it determines everything that is random
@@ -76,20 +81,14 @@ def collect(
     return data, observation_space, action_space
 
 
-def _action_source(family: Family, client: int, policy: BehaviorPolicy | None) -> ActionSource:
-    if family.world != "bandit2d":
-        return policy or behavior_policy(family.backbone)
-    peak = np.asarray(family.client(client).peak)  # type: ignore[attr-defined]
-
-    def around_peak(observations: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        radius = BANDIT_RADIUS * np.sqrt(rng.random(len(observations)))
-        angle = 2.0 * np.pi * rng.random(len(observations))
-        return (peak + radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])).astype(np.float32)
-
-    return around_peak
+def _action_source(family: Family, client: int, policy: BehaviorPolicy | None) -> ScriptedPolicy:
+    if policy is not None:
+        return policy
+    scripted: ScriptedPolicy | None = environment_class(family.world).scripted_policy(family, client)
+    return scripted or behavior_policy(family.backbone)
 
 
-def _roll_out(env: FederatedVecEnv, act: ActionSource, rng: np.random.Generator, size: int, n_copies: int) -> OfflineData:
+def _roll_out(env: FederatedVecEnv, act: ScriptedPolicy, rng: np.random.Generator, size: int, n_copies: int) -> OfflineData:
     n_steps = -(-size // n_copies)
     observations = np.asarray(env.reset())
     shape = (n_copies, n_steps)

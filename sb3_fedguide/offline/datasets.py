@@ -14,7 +14,7 @@ from fed_envs import Family, load_family
 from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.behavior import BehaviorPolicy
 from sb3_fedguide.offline.cache import cache_folder, content_key, publish_folder, read_arrays, write_arrays
-from sb3_fedguide.offline.collect import collect, default_size, source_key
+from sb3_fedguide.offline.collect import behavior_name, collect, default_size, source_key
 from sb3_fedguide.offline.data import OfflineData, normalize_observations
 from sb3_fedguide.offline.minari_io import check_spaces, find_dataset, read_minari, write_minari
 from sb3_fedguide.offline.progress import StepProgress
@@ -107,7 +107,7 @@ def _made_on_the_spot(
             observation_space,
             action_space,
             {
-                "algorithm_name": "uniform around the peak" if family.world == "bandit2d" else "squashed PPO, medium",
+                "algorithm_name": behavior_name(family, client, policy),
                 "description": f"{family.name}, client {client}, made by sb3_fedguide with seed {seed}",
             },
         )
