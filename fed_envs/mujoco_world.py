@@ -27,6 +27,7 @@ class MujocoClientEnv(ClientEnv[ClientT]):
     :param height: height of rendered images in pixels
     """
 
+    metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}  # noqa: RUF012
     _batch: MujocoBatch[Any]
 
     def __init__(self, *args: Any, width: int = 480, height: int = 480, **kwargs: Any) -> None:
@@ -34,9 +35,13 @@ class MujocoClientEnv(ClientEnv[ClientT]):
         self.width, self.height = width, height
         self._renderer: Any = None
 
-    def _build(self, xml_file: str, frame_skip: int, observation_dim: int) -> None:
-        """Make model and data with this client's parameters, and the spaces."""
-        self.model = copy.deepcopy(_compiled(xml_file))  # a copy each: nobody's change reaches another client
+    def _build(self, model: str | mujoco.MjModel, frame_skip: int, observation_dim: int) -> None:
+        """Make model and data with this client's parameters, and the spaces.
+
+        :param model: the name of one of Gymnasium's files, or a compiled model
+        """
+        # a copy each: nobody's change reaches another client
+        self.model = copy.deepcopy(_compiled(model) if isinstance(model, str) else model)
         self.frame_skip = frame_skip
         self.dt = self.model.opt.timestep * frame_skip
         self._apply_parameters()
@@ -45,10 +50,7 @@ class MujocoClientEnv(ClientEnv[ClientT]):
         self.init_qvel = self.data.qvel.copy()
         self.observation_space = spaces.Box(-np.inf, np.inf, (observation_dim,), np.float64)
         self.action_space = spaces.Box(-1.0, 1.0, (self.model.nu,), np.float32)
-        self.metadata = {
-            "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
-            "render_fps": round(1.0 / self.dt),
-        }
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.dt)}
         self._start()
 
     def _apply_parameters(self) -> None:

@@ -9,8 +9,9 @@ from sb3_fedguide.cli.names import nearest
 
 USAGE = """usage: fedguide COMMAND ...
 
-  train    train a federation (the same as train.py)
-  demo     FedAvg beside FedGuide on Bandit2D, with a picture
+  train     train a federation (the same as train.py)
+  evaluate  evaluate a finished run's policies, client by client
+  demo      FedAvg beside FedGuide on Bandit2D, with a picture
 
 fedguide COMMAND --help shows a command's flags"""
 
@@ -26,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(__version__)
         return 0
-    commands: dict[str, Callable[[Sequence[str]], int]] = {"train": _train, "demo": _demo}
+    commands: dict[str, Callable[[Sequence[str]], int]] = {"train": _train, "evaluate": _evaluate, "demo": _demo}
     if arguments[0] not in commands:
         print(f"fedguide: error: unknown command {arguments[0]!r}.{nearest(arguments[0], commands)} Known: "
               f"{', '.join(commands)}", file=sys.stderr)  # fmt: skip
@@ -38,6 +39,12 @@ def _train(argv: Sequence[str]) -> int:
     from sb3_fedguide.cli.train import main
 
     return main(argv, prog="fedguide train")
+
+
+def _evaluate(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.evaluate import main
+
+    return main(argv)
 
 
 def _demo(argv: Sequence[str]) -> int:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
+import numpy as np
+
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback
 from sb3_fedguide.common.evaluation import Evaluation, FederatedEvalCallback
 
@@ -40,6 +42,27 @@ class CostCallback(RoundCallback):
         now = time.perf_counter()
         self.round_seconds.append(now - self._started)
         self._started = now
+
+
+class DeployedCallback(RoundCallback):
+    """Remembers the policies as they left local training: the exchange may replace them before the model is saved."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._state: dict[str, np.ndarray] = {}
+
+    def _on_local_training_end(self) -> None:
+        self._state = _arrays(self.model)
+
+    def replaced(self) -> dict[str, np.ndarray]:
+        """The deployed policies' parameters where they differ from the model's own, else nothing."""
+        now = _arrays(self.model)
+        same = all(np.array_equal(array, now[name]) for name, array in self._state.items())
+        return {} if same else self._state
+
+
+def _arrays(model: Any) -> dict[str, np.ndarray]:
+    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in model.policy.state_dict().items()}
 
 
 class RunEvalCallback(FederatedEvalCallback):

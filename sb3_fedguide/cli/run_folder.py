@@ -10,10 +10,15 @@ import re
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
+if TYPE_CHECKING:
+    import numpy as np
+
+#: Parameters of the policies before the last exchange.
+DEPLOYED = "deployed.npz"
 PACKAGES = (
     "sb3-fedguide", "stable-baselines3", "gymnasium", "gymnasium-robotics", "mujoco", "torch", "numpy", "scipy", "POT",
     "minari", "pydantic", "tensorboard",
@@ -66,6 +71,34 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
     write_text(path, yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None))
+
+
+def write_deployed(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """The policies that the clients deploy, as plain arrays beside the saved model; complete or not at all."""
+    import numpy as np
+
+    temporary = folder / f"{DEPLOYED}.part"
+    with temporary.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+    temporary.replace(folder / DEPLOYED)
+
+
+def read_deployed(folder: Path) -> dict[str, np.ndarray]:
+    """What :func:`write_deployed` wrote; nothing where the saved model's policies are the deployed ones.
+
+    :raises ValueError: if the file is damaged
+    """
+    import zipfile
+
+    import numpy as np
+
+    if not (folder / DEPLOYED).is_file():
+        return {}
+    try:
+        with np.load(folder / DEPLOYED, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{folder / DEPLOYED} cannot be read: {error}") from None
 
 
 def versions() -> dict[str, str]:

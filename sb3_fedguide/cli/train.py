@@ -120,7 +120,7 @@ class Run:
 
     def __call__(self) -> int:
         from sb3_fedguide.cli.report import print_summary
-        from sb3_fedguide.cli.run_folder import create_run_folder, write_json
+        from sb3_fedguide.cli.run_folder import create_run_folder, write_deployed, write_json
 
         arguments, model = self.arguments, self.model
         folder = create_run_folder(Path(arguments.log_folder), arguments.algo, self.family.name)
@@ -142,6 +142,8 @@ class Run:
             model.logger.close()
         if model.round > 0:
             model.save(folder / "model.zip")
+            if deployed := self._deployed.replaced():
+                write_deployed(folder, deployed)
         write_json(folder / "summary.json", summary)
         if arguments.verbose:
             print_summary(summary, str(folder))
@@ -172,11 +174,11 @@ class Run:
         self.model.set_logger(Logger(str(events), outputs))
 
     def _train(self, folder: Path) -> dict[str, Any]:
-        from sb3_fedguide.cli.recorder import CostCallback, RunEvalCallback
+        from sb3_fedguide.cli.recorder import CostCallback, DeployedCallback, RunEvalCallback
 
         arguments, model = self.arguments, self.model
         self._started, self._pretraining_seconds = time.perf_counter(), 0.0
-        self._costs, self._evaluation = CostCallback(), None
+        self._costs, self._deployed, self._evaluation = CostCallback(), DeployedCallback(), None
         if not arguments.no_eval:
             self._evaluation = RunEvalCallback(
                 self.config.n_rounds, arguments.eval_freq, arguments.eval_episodes, folder / "evaluations.csv"
@@ -188,7 +190,7 @@ class Run:
         self._pretraining_seconds = time.perf_counter() - self._started
         model.learn(
             self.config.n_rounds * model.rollout_size * model.n_clients,
-            [callback for callback in (self._evaluation, self._costs) if callback is not None],
+            [callback for callback in (self._evaluation, self._costs, self._deployed) if callback is not None],
             progress_bar=arguments.progress,
         )
         return self._summary()

@@ -13,13 +13,10 @@ import numpy as np
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide.common.callbacks import RoundCallback
-from sb3_fedguide.common.seeding import Role
+from sb3_fedguide.common.seeding import EVALUATION_SEED, Role
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
-
-#: The seed of evaluation episodes: the same episodes for every method, seed and round.
-EVALUATION_SEED = 20_000
 
 
 @dataclass(frozen=True)

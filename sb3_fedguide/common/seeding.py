@@ -6,7 +6,11 @@ from enum import IntEnum
 
 from fed_envs.seeding import integer_seed, seed_sequence, stream
 
-__all__ = ["Role", "integer_seed", "seed_sequence", "stream"]
+__all__ = ["EVALUATION_SEED", "Role", "integer_seed", "seed_sequence", "stream"]
+
+
+#: The seed of evaluation episodes: the same episodes for every method, seed and round.
+EVALUATION_SEED = 20_000
 
 
 class Role(IntEnum):

@@ -1,0 +1,222 @@
+"""The evaluation command: a finished run's policies, client by client, in seeded episodes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_fedguide.algorithms import ALGORITHMS
+from sb3_fedguide.cli.arguments import OneLineParser
+
+if TYPE_CHECKING:
+    import numpy as np
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from fed_envs import Family
+    from sb3_fedguide.common.evaluation import Evaluation
+    from sb3_fedguide.common.federation import Federation
+
+#: A picture file's frames: more would make it unwieldy.
+MAX_FRAMES = 200
+
+
+def main(argv: Sequence[str] | None = None, prog: str = "fedguide evaluate") -> int:
+    """Run the command.
+
+    :return: the exit code: 0, or 2 for wrong input
+    """
+    parser = _parser(prog)
+    arguments = parser.parse_args(argv)
+    try:
+        _check(arguments)
+        run, family = _read_run(Path(arguments.run))
+        model = _load(Path(arguments.run), run, family)
+        policies = _policies(arguments, Path(arguments.run))
+        if arguments.video is not None:
+            _check_rendering(family)
+    except ValueError as error:
+        parser.error(" ".join(str(error).split()))
+    result = _evaluate(arguments, run, family, model, policies)
+    text = json.dumps(result, indent=2)
+    if arguments.output is None:
+        print(text)
+    else:
+        from sb3_fedguide.cli.run_folder import write_text
+
+        write_text(Path(arguments.output), text + "\n")
+        for name, values in result["policies"].items():
+            print(f"{name}: average {values['average']:.2f}, worst client {values['worst_client']:.2f}")
+    return 0
+
+
+def _parser(prog: str) -> OneLineParser:
+    from sb3_fedguide.common.seeding import EVALUATION_SEED
+
+    parser = OneLineParser(prog=prog, description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    flag = parser.add_argument
+    flag("run", metavar="RUN", help="folder of a run, e.g. logs/fedguide/HopperHard_1")
+    flag("--policy", choices=("deployed", "broadcast", "both"), default="both", help="the clients' own policies as they left "
+         "local training, what the server sent after it, or both where they differ")  # fmt: skip
+    flag("--episodes", type=int, default=10, metavar="N", help="episodes per client")
+    flag("--seed", type=int, default=EVALUATION_SEED, help="of the episodes; the default is that of training's evaluations")
+    flag("--stochastic", action="store_true", help="sample actions instead of taking their mean")
+    flag("-o", "--output", metavar="FILE", help="write the JSON there instead of to the terminal")
+    flag("--video", metavar="DIR", help="write one animated picture (GIF) of each client's first episode there")
+    return parser
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    if arguments.episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, not {arguments.episodes}")
+    if not 0 <= arguments.seed < 2**31:
+        raise ValueError(f"--seed must lie in [0, 2^31), not {arguments.seed}")
+    if arguments.output is not None and not Path(arguments.output).absolute().parent.is_dir():
+        raise ValueError(f"--output: there is no folder {Path(arguments.output).parent}")
+    if arguments.video is not None:
+        from sb3_fedguide.cli.run_folder import check_log_folder
+
+        check_log_folder(Path(arguments.video))
+
+
+def _read_run(folder: Path) -> tuple[dict[str, Any], Family]:
+    """``summary.json`` and the family of a run folder.
+
+    :raises ValueError: if the folder is none of a run that was trained
+    """
+    from fed_envs.metadata import read_family
+
+    for name in ("model.zip", "summary.json", "metadata.json"):
+        if not (folder / name).is_file():
+            raise ValueError(f"{folder} is not the folder of a trained run: it has no {name}")
+    try:
+        run = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{folder / 'summary.json'} is not valid JSON: {error}") from None
+    if run.get("algo") not in ALGORITHMS:
+        raise ValueError(f"{folder}: unknown algorithm {run.get('algo')!r}; known are {', '.join(ALGORITHMS)}")
+    return run, read_family(folder / "metadata.json")
+
+
+def _load(folder: Path, run: dict[str, Any], family: Family) -> Federation:
+    import zipfile
+
+    import torch as th
+
+    from fed_envs import FederatedVecEnv
+    from sb3_fedguide.algorithms import algorithm
+
+    th.set_num_threads(1)
+    try:
+        return algorithm(run["algo"]).load(folder / "model.zip", env=FederatedVecEnv(family), device="cpu")  # type: ignore
+    except (zipfile.BadZipFile, EOFError, KeyError, RuntimeError, ValueError) as error:
+        raise ValueError(f"{folder / 'model.zip'} cannot be read: {error}") from None
+
+
+def _policies(arguments: argparse.Namespace, folder: Path) -> dict[str, dict[str, np.ndarray]]:
+    """What to evaluate: a policy's name to the parameters to put in place of the saved model's (none for itself)."""
+    from sb3_fedguide.cli.run_folder import read_deployed
+
+    deployed = read_deployed(folder)
+    if not deployed:  # the exchange did not touch the policies: there is one of each client, and it is deployed
+        if arguments.policy == "broadcast":
+            raise ValueError("this method sends its clients no policies, so there is no broadcast one; leave --policy out")
+        return {"deployed": {}}
+    found = {"deployed": deployed, "broadcast": {}}
+    return found if arguments.policy == "both" else {arguments.policy: found[arguments.policy]}
+
+
+@contextmanager
+def _in_place(model: Federation, arrays: dict[str, np.ndarray]) -> Iterator[None]:
+    """The model with other parameters for a while."""
+    import torch as th
+
+    before = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
+    model.policy.load_state_dict({**before, **{name: th.as_tensor(array) for name, array in arrays.items()}})
+    try:
+        yield
+    finally:
+        model.policy.load_state_dict(before)
+
+
+def _evaluate(
+    arguments: argparse.Namespace,
+    run: dict[str, Any],
+    family: Family,
+    model: Federation,
+    policies: dict[str, dict[str, np.ndarray]],
+) -> dict[str, Any]:
+    from sb3_fedguide.common.evaluation import evaluate_federation, evaluation_env
+
+    deterministic = not arguments.stochastic
+    if arguments.stochastic:
+        model.set_random_seed(arguments.seed)  # type: ignore[attr-defined]
+    results = {}
+    for name, arrays in policies.items():
+        env = evaluation_env(model, arguments.episodes)
+        with _in_place(model, arrays):
+            results[name] = _numbers(
+                evaluate_federation(lambda obs: model.predict(obs, deterministic=deterministic)[0], env, arguments.seed)
+            )
+            if arguments.video is not None:
+                _write_videos(Path(arguments.video), name, family, model, arguments.seed)
+        env.close()
+    return {
+        "run": str(arguments.run),
+        "algo": run["algo"],
+        "env": run["env"],
+        "rounds_done": run["rounds_done"],
+        "clients": model.client_ids,
+        "n_episodes": arguments.episodes,
+        "seed": arguments.seed,
+        "deterministic": deterministic,
+        "policies": results,
+    }
+
+
+def _numbers(evaluation: Evaluation) -> dict[str, Any]:
+    return {
+        "average": evaluation.average,
+        "worst_client": evaluation.worst_client,
+        "client_returns": evaluation.client_returns.tolist(),
+        "client_return_std": evaluation.returns.std(axis=1).tolist(),
+        "client_lengths": evaluation.lengths.mean(axis=1).tolist(),
+        "returns": evaluation.returns.tolist(),
+    }
+
+
+def _check_rendering(family: Family) -> None:
+    """:raises ValueError: where nothing can be drawn"""
+    env = family.make(0)
+    modes = env.metadata.get("render_modes", [])
+    env.close()
+    if "rgb_array" not in modes:
+        raise ValueError(f"--video: {family.name} cannot be drawn")
+
+
+def _write_videos(folder: Path, policy: str, family: Family, model: Federation, seed: int) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for client in model.client_ids:
+        path = folder / f"{family.name}-client{client}-{policy}.gif"
+        _write_video(path, family, client, model.client(client), seed)
+        print(f"wrote {path}", file=sys.stderr)
+
+
+def _write_video(path: Path, family: Family, client: int, policy: BaseAlgorithm, seed: int) -> None:
+    from PIL import Image
+
+    env = family.make(client, render_mode="rgb_array")
+    every = max(1, family.max_episode_steps // MAX_FRAMES)
+    obs, _ = env.reset(seed=seed)
+    frames, step, done = [], 0, False
+    while not done:
+        if step % every == 0:
+            frames.append(Image.fromarray(env.render()).resize((240, 240)))  # type: ignore[arg-type]
+        obs, _, terminated, truncated, _ = env.step(policy.predict(obs, deterministic=True)[0])
+        step, done = step + 1, terminated or truncated
+    env.close()
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=40, loop=0)

@@ -1,0 +1,76 @@
+"""``fedguide evaluate``: the figures of a run come out again, and wrong input says what is wrong."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from sb3_fedguide.cli.main import main
+
+SMALL = ["--rounds", "2", "--eval-episodes", "2", "--verbose", "0", "-params", "rollout_size:100", "n_envs_per_client:2",
+         "bc_weight:0", "batch_size:50"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    for algo in ("local", "fedavg"):
+        assert main(["train", "--algo", algo, "--env", "Reacher", "-f", str(folder), *SMALL]) == 0
+    return {algo: folder / algo / "Reacher_1" for algo in ("local", "fedavg")}
+
+
+def evaluated(run, *flags, output):
+    assert main(["evaluate", str(run), "--episodes", "2", "-o", str(output), *flags]) == 0
+    return json.loads(output.read_text())["policies"]
+
+
+@pytest.mark.parametrize("algo", ["local", "fedavg"])
+def test_the_last_evaluation_of_the_run_comes_out_again(runs, algo, tmp_path):
+    summary = json.loads((runs[algo] / "summary.json").read_text())
+    policies = evaluated(runs[algo], output=tmp_path / "result.json")
+    assert set(policies) == ({"deployed", "broadcast"} if algo == "fedavg" else {"deployed"})
+    for name, values in policies.items():
+        np.testing.assert_array_equal(values["client_returns"], summary[name]["client_returns"])
+        assert np.shape(values["returns"]) == (8, 2)
+
+
+def test_other_episodes_and_sampled_actions_give_other_returns(runs, tmp_path):
+    default, other, sampled, again = (
+        evaluated(runs["local"], *flags, output=tmp_path / "result.json")["deployed"]["returns"]
+        for flags in ((), ("--seed", "1"), ("--stochastic",), ("--stochastic",))
+    )
+    assert default != other and default != sampled
+    assert sampled == again
+
+
+def test_pictures_of_every_client(runs, tmp_path, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    evaluated(runs["local"], "--video", str(tmp_path / "video"), output=tmp_path / "result.json")
+    pictures = sorted((tmp_path / "video").iterdir())
+    assert len(pictures) == 8
+    assert all(picture.read_bytes().startswith(b"GIF8") for picture in pictures)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["{folder}/nothing"], "it has no model.zip"),
+        (["{run}", "--episodes", "0"], "--episodes must be at least 1"),
+        (["{run}", "--policy", "broadcast"], "no broadcast one"),
+        (["{run}", "-o", "{folder}/missing/result.json"], "there is no folder"),
+        (["{damaged}"], "model.zip cannot be read"),
+    ],
+)
+def test_wrong_input_is_one_line_and_exit_code_2(runs, flags, message, tmp_path, capsys):
+    damaged = tmp_path / "damaged"
+    damaged.mkdir()
+    for name in ("summary.json", "metadata.json"):
+        (damaged / name).write_bytes((runs["local"] / name).read_bytes())
+    (damaged / "model.zip").write_bytes(b"PK nothing")
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", *(flag.format(folder=tmp_path, run=runs["local"], damaged=damaged) for flag in flags)])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
