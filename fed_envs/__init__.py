@@ -31,7 +31,7 @@ _LAZY = {
     "FederatedVecEnv": "fed_envs.vec_env",
 }
 
-_SUBMODULES = ("bandit2d", "generation", "locomotion", "metadata", "reacher", "vec_env")
+_SUBMODULES = ("bandit2d", "generation", "locomotion", "metadata", "metaworld10", "point_maze", "reacher", "vec_env")
 
 
 def __getattr__(name: str) -> Any:

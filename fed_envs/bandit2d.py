@@ -15,6 +15,7 @@ PEAKS = np.array(BANDIT2D_PEAKS)  # (4, 2)
 SIGMA = 0.2  # width of the reward modes
 ACTION_LIMIT = 1.5
 DATA_RADIUS = 0.3
+IMAGE_SIZE = 240
 
 
 def peak_weights(client: Bandit2DClient) -> np.ndarray:
@@ -50,9 +51,11 @@ class Bandit2DBatch(Batch["Bandit2DEnv"]):
         super().__init__(envs)
         self.weights = np.array([peak_weights(env.client) for env in envs])
         self.terminated[:] = True
+        self.actions = np.zeros((len(envs), 2))
 
     def step(self, actions: np.ndarray, rows: Sequence[int], run: Runner = run_here) -> None:
         clipped = np.clip(actions, -ACTION_LIMIT, ACTION_LIMIT).astype(np.float64)
+        self.actions = clipped
         self.rewards[:] = _reward(clipped, self.weights)
 
     def info(self, row: int) -> dict[str, Any]:
@@ -83,6 +86,7 @@ class Bandit2DEnv(ClientEnv[Bandit2DClient]):
     * v0: Initial version
     """
 
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
     world = "bandit2d"
     batch_class = Bandit2DBatch
 
@@ -115,3 +119,12 @@ class Bandit2DEnv(ClientEnv[Bandit2DClient]):
 
     def _reset(self) -> tuple[np.ndarray, dict[str, Any]]:
         return np.zeros(2, dtype=np.float32), {}
+
+    def render(self) -> np.ndarray:
+        """The reward over all actions as shades of blue, and the last action as a red dot, ``(240, 240, 3)`` uint8."""
+        axis = np.linspace(-ACTION_LIMIT, ACTION_LIMIT, IMAGE_SIZE)
+        grid = np.stack(np.meshgrid(axis, -axis), axis=-1)  # the second action upwards
+        heights = _reward(grid, peak_weights(self.client))
+        image = np.stack([255 - 200 * heights, 255 - 120 * heights, np.full_like(heights, 255)], axis=-1).astype(np.uint8)
+        image[np.square(grid - self._batch.actions[0]).sum(axis=-1) < 0.05**2] = (220, 30, 30)  # type: ignore[attr-defined]
+        return image

@@ -14,11 +14,15 @@ from typing import Any
 
 import numpy as np
 
+from fed_envs.mazes import MAZES, distances, free_cells
 from fed_envs.metadata import BANDIT2D_PEAKS, SCHEMA_VERSION, Family, load_family, parse_family
 from fed_envs.registration import FAMILIES
 
-#: Seeds that give back the shipped families (eight clients).
+#: Seeds that give back the paper's families (eight clients).
 PAPER_SEEDS = {"Hopper": 2026, "HopperHard": 2026, "Walker2D": 2026, "Walker2DHard": 2026, "Reacher": 42, "ReacherHard": 42}
+
+#: Likewise for families that are ours.
+OWN_SEEDS = {"PointMaze": 2026, "PointMazeHard": 2026}
 
 _DYNAMICS_FIELDS = ("mass_scale", "damping_scale", "friction_scale", "action_gain")
 
@@ -218,6 +222,29 @@ def _bandit2d_clients(n_clients: int, seed: int) -> list[dict[str, Any]]:
     return [{"client": k, "peak": list(BANDIT2D_PEAKS[k % len(BANDIT2D_PEAKS)])} for k in range(n_clients)]
 
 
+def _point_maze_clients(hard: bool, n_clients: int, seed: int) -> list[dict[str, Any]]:
+    """Goals take a maze's free cells in a random order; hard clients have mazes in turn and start in a few cells."""
+    random = np.random.default_rng(seed)
+    mazes = ("Open", "UMaze", "Medium", "Large") if hard else ("Open",)
+    gears, dampings = ((0.4, 1.5), (0.5, 20.0)) if hard else ((0.6, 1.2), (0.5, 5.0))
+    orders = {maze: random.permutation(free_cells(MAZES[maze])).tolist() for maze in mazes}
+    clients = []
+    for k in range(n_clients):
+        maze = mazes[k % len(mazes)]
+        goal = orders[maze][k // len(mazes) % len(orders[maze])]
+        client: dict[str, Any] = {"client": k, "maze": maze, "goal_cells": [goal]}
+        if hard:
+            steps = distances(MAZES[maze], (goal[0], goal[1]))
+            middles = [cell for cell, distance in steps.items() if 3 <= distance <= 5]
+            region = distances(MAZES[maze], middles[random.integers(len(middles))])
+            client["start_cells"] = sorted([*cell] for cell, distance in region.items() if distance <= 1)
+        for field, (low, high) in (("gear_scale", gears), ("damping_scale", dampings)):
+            client[field] = _digits(math.exp(random.uniform(math.log(low), math.log(high))))
+        client["reward_scale"] = _digits(random.uniform(0.6, 1.6))
+        clients.append(client)
+    return clients
+
+
 _GENERATORS: dict[str, Callable[[int, int], Sequence[dict[str, Any]]]] = {
     "Bandit2D": _bandit2d_clients,
     "Reacher": lambda n_clients, seed: _reacher_clients(False, n_clients, seed),
@@ -228,6 +255,8 @@ _GENERATORS: dict[str, Callable[[int, int], Sequence[dict[str, Any]]]] = {
     "Walker2DHard": lambda n_clients, seed: _legged_clients(LEGGED_HARD, n_clients, seed),
     "HalfCheetah": lambda n_clients, seed: _cheetah_clients(CHEETAH, n_clients, seed),
     "HalfCheetahHard": lambda n_clients, seed: _cheetah_clients(CHEETAH_HARD, n_clients, seed),
+    "PointMaze": lambda n_clients, seed: _point_maze_clients(False, n_clients, seed),
+    "PointMazeHard": lambda n_clients, seed: _point_maze_clients(True, n_clients, seed),
 }
 
 

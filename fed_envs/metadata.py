@@ -5,7 +5,8 @@ A metadata file is JSON::
     {"schema_version": 1, "family": "HopperHard", "world": "locomotion", "backbone": "Hopper-v5",
      "max_episode_steps": 1000, "description": "...", "clients": [{"client": 0, "mass_scale": 0.9158037, ...}, ...]}
 
-What a client has to say depends on the world: :class:`LocomotionClient`, :class:`ReacherClient`, :class:`Bandit2DClient`.
+What a client has to say depends on the world: :class:`LocomotionClient`, :class:`ReacherClient`, :class:`Bandit2DClient`,
+:class:`MetaWorldClient`, :class:`PointMazeClient`.
 Anything unknown, missing, non-finite or out of range is refused with a message that names the file, the client and the field.
 On the command line: ``python -m fed_envs.metadata {generate,show,validate}``.
 """
@@ -26,6 +27,7 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationError, field_validator, model_validator
 
+from fed_envs.mazes import check_cells, free_cells, maze_rows
 from fed_envs.registration import ENTRY_POINTS, FAMILIES, METADATA_FOLDER, environment_id
 
 SCHEMA_VERSION: Literal[1] = 1
@@ -38,6 +40,8 @@ BACKBONES: dict[str, tuple[str, ...]] = {
     "bandit2d": ("Bandit2D",),
     "reacher": ("Reacher-v5",),
     "locomotion": ("Hopper-v5", "Walker2d-v5", "HalfCheetah-v5"),
+    "metaworld": ("MetaWorld-v3",),
+    "point_maze": ("PointMaze-v3",),
 }
 
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -46,6 +50,7 @@ _Factor = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=100)
 _Weight = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1000, le=1000)]
 _Cost = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1000)]
 _Unit = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1, le=1)]
+_Cell = tuple[Annotated[int, Field(strict=True, ge=0)], Annotated[int, Field(strict=True, ge=0)]]
 _Reach = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-REACHER_GOAL_LIMIT, le=REACHER_GOAL_LIMIT)]
 
 
@@ -107,6 +112,32 @@ class ReacherClient(Client):
         return self
 
 
+class PointMazeClient(Client):
+    """A client of the PointMaze families; cells are (row, column), see :mod:`fed_envs.mazes`."""
+
+    maze: str | tuple[str, ...]  # a name in fed_envs.mazes.MAZES, or rows of "#" and "."
+    goal_cells: Annotated[tuple[_Cell, ...], Field(min_length=1)]
+    start_cells: tuple[_Cell, ...] = ()  # none: every free cell but the goals
+    gear_scale: _Scale = 1.0
+    damping_scale: _Factor = 1.0
+    reward_scale: _Scale = 1.0
+
+    @field_validator("maze", mode="before")
+    @classmethod
+    def _closed_maze(cls, maze: Any) -> str | tuple[str, ...]:
+        rows = maze_rows(maze)
+        return maze if isinstance(maze, str) else rows
+
+    @model_validator(mode="after")
+    def _cells_are_free_and_connected(self) -> PointMazeClient:
+        check_cells(maze_rows(self.maze), self.goal_cells, self.start_cells, self.starts())
+        return self
+
+    def starts(self) -> tuple[tuple[int, int], ...]:
+        """The cells in which episodes start."""
+        return self.start_cells or tuple(cell for cell in free_cells(maze_rows(self.maze)) if cell not in self.goal_cells)
+
+
 class Bandit2DClient(Client):
     """A client of Bandit2D: which of the four peaks is its own, and how high the other three are."""
 
@@ -124,10 +155,33 @@ class Bandit2DClient(Client):
 #: Centres of Bandit2D's four reward modes.
 BANDIT2D_PEAKS: tuple[tuple[float, float], ...] = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
+#: The tasks of MetaWorld10.
+METAWORLD_TASKS: tuple[str, ...] = (
+    "reach-v3", "push-v3", "pick-place-v3", "door-open-v3", "drawer-close-v3", "button-press-topdown-v3",
+    "peg-insert-side-v3", "window-open-v3", "sweep-v3", "basketball-v3",
+)  # fmt: skip
+
+
+class MetaWorldClient(Client):
+    """A client of MetaWorld10: its task, and whether object and goal start in the same place in every episode."""
+
+    task: str
+    fixed_goal: Annotated[bool, Field(strict=True)] = False
+
+    @field_validator("task")
+    @classmethod
+    def _known_task(cls, task: str) -> str:
+        if task not in METAWORLD_TASKS:
+            raise ValueError(f"must be one of {', '.join(METAWORLD_TASKS)}, not {task!r}")
+        return task
+
+
 CLIENT_MODELS: dict[str, type[Client]] = {
     "bandit2d": Bandit2DClient,
     "reacher": ReacherClient,
     "locomotion": LocomotionClient,
+    "metaworld": MetaWorldClient,
+    "point_maze": PointMazeClient,
 }
 
 
@@ -138,7 +192,7 @@ class Family(BaseModel):
 
     schema_version: Literal[1] = SCHEMA_VERSION
     name: Annotated[str, Field(alias="family", pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-    world: Literal["bandit2d", "reacher", "locomotion"]
+    world: Literal["bandit2d", "reacher", "locomotion", "metaworld", "point_maze"]
     backbone: str
     max_episode_steps: Annotated[int, Field(strict=True, ge=1)]
     description: str = ""

@@ -16,6 +16,8 @@ ENTRY_POINTS = {
     "bandit2d": "fed_envs.bandit2d:Bandit2DEnv",
     "reacher": "fed_envs.reacher:ReacherEnv",
     "locomotion": "fed_envs.locomotion:LocomotionEnv",
+    "metaworld": "fed_envs.metaworld10:MetaWorldEnv",
+    "point_maze": "fed_envs.point_maze:PointMazeEnv",
 }
 
 #: Names of the families that ship with the package, one metadata file each.

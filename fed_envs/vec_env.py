@@ -50,8 +50,9 @@ class FederatedVecEnv(VecEnv):
     Environments are ordered client by client: index = position in ``client_ids`` * ``n_envs_per_client`` + copy. Each has its
     own random stream, so that a client's trajectory does not depend on who else is here. Finished environments are reset at
     once, as SB3 expects; ``infos[i]`` of a finished one has ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``
-    (``r`` return, ``l`` length, ``t`` seconds since the start, as of ``Monitor``). The info of an unfinished one is empty:
-    filling it would cost more than the arithmetic of the step.
+    (``r`` return, ``l`` length, ``t`` seconds since the start, as of ``Monitor``). The info of an unfinished one is empty,
+    except for ``success`` and ``is_success`` where the world knows a success: filling it would cost more than the arithmetic
+    of the step.
 
     It pickles and copies with the state of simulators and random streams, so that a copy goes on exactly like the original.
 

@@ -13,18 +13,30 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sb3_fedguide.algorithms import register_algorithm
     from sb3_fedguide.algorithms.fedavg import FedAvg
     from sb3_fedguide.algorithms.fedguide import FedGuide, FedGuideA, FedGuideP
+    from sb3_fedguide.algorithms.fedkl import FedKL
+    from sb3_fedguide.algorithms.fedprox import FedProx
+    from sb3_fedguide.algorithms.fedrl import FedRL
+    from sb3_fedguide.algorithms.fedsvrpgm import FedSVRPGM
     from sb3_fedguide.algorithms.local import Local
     from sb3_fedguide.common.evaluation import FederatedEvalCallback, evaluate_federation
+    from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
 _LAZY = {
+    "register_algorithm": "sb3_fedguide.algorithms",
     "FedAvg": "sb3_fedguide.algorithms.fedavg",
     "FedGuide": "sb3_fedguide.algorithms.fedguide",
     "FedGuideA": "sb3_fedguide.algorithms.fedguide",
     "FedGuideP": "sb3_fedguide.algorithms.fedguide",
+    "FedKL": "sb3_fedguide.algorithms.fedkl",
+    "FedProx": "sb3_fedguide.algorithms.fedprox",
+    "FedRL": "sb3_fedguide.algorithms.fedrl",
+    "FedSVRPGM": "sb3_fedguide.algorithms.fedsvrpgm",
     "Local": "sb3_fedguide.algorithms.local",
+    "FederatedDDPG": "sb3_fedguide.common.federated_ddpg",
     "FederatedEvalCallback": "sb3_fedguide.common.evaluation",
     "FederatedPPO": "sb3_fedguide.common.federated_ppo",
     "evaluate_federation": "sb3_fedguide.common.evaluation",
@@ -36,11 +48,17 @@ __all__ = [
     "FedGuide",
     "FedGuideA",
     "FedGuideP",
+    "FedKL",
+    "FedProx",
+    "FedRL",
+    "FedSVRPGM",
+    "FederatedDDPG",
     "FederatedEvalCallback",
     "FederatedPPO",
     "Local",
     "__version__",
     "evaluate_federation",
+    "register_algorithm",
 ]
 
 

@@ -33,6 +33,9 @@ FAMILY_NAMES = {
     "Walker2DHard",
     "HalfCheetah",
     "HalfCheetahHard",
+    "MetaWorld10",
+    "PointMaze",
+    "PointMazeHard",
 }
 
 # What the checkers say about Gymnasium's own environments too: infinite observation bounds, action bounds other than 1.

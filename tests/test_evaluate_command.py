@@ -7,7 +7,10 @@ import json
 import numpy as np
 import pytest
 
+from fed_envs import FederatedVecEnv
+from fed_envs.point_maze import PointMazeEnv
 from sb3_fedguide.cli.main import main
+from sb3_fedguide.common.evaluation import evaluate_federation
 
 SMALL = ["--rounds", "2", "--eval-episodes", "2", "--verbose", "0", "-params", "rollout_size:100", "n_envs_per_client:2",
          "bc_weight:0", "batch_size:50"]  # fmt: skip
@@ -47,6 +50,7 @@ def test_other_episodes_and_sampled_actions_give_other_returns(runs, tmp_path):
 
 def test_pictures_of_every_client(runs, tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr("sb3_fedguide.cli.evaluate.MAX_FRAMES", 5)
     evaluated(runs["local"], "--video", str(tmp_path / "video"), output=tmp_path / "result.json")
     pictures = sorted((tmp_path / "video").iterdir())
     assert len(pictures) == 8
@@ -74,3 +78,20 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, flags, message, tmp_path,
     assert stop.value.code == 2
     error = capsys.readouterr().err
     assert message in error and len(error.splitlines()) == 1
+
+
+def test_success_rates_are_evaluated_beside_returns():
+    env = FederatedVecEnv("PointMaze", n_envs_per_client=3, clients=[0, 5])
+    controllers = [PointMazeEnv.scripted_policy(env.family, client) for client in (0, 5)]
+    rng = np.random.default_rng(0)
+
+    def control(obs):
+        halves = np.split(obs, 2)
+        return np.concatenate([act(half, rng) for act, half in zip(controllers, halves, strict=True)])
+
+    reached = evaluate_federation(control, env)
+    assert reached.successes.shape == (2, 3)
+    np.testing.assert_array_equal(reached.success_rates, [1.0, 1.0])
+    idle = evaluate_federation(lambda obs: np.zeros((6, 2), dtype=np.float32), env)
+    assert idle.success_rates.mean() < 1.0
+    assert evaluate_federation(lambda obs: np.zeros((8, 2)), FederatedVecEnv("Reacher")).success_rates is None

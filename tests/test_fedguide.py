@@ -91,7 +91,7 @@ def test_minibatch_prior_loss_averages_to_the_rollouts(tiny):
         assert th.allclose(buffer.extras["prior_weights"].mean(dim=1), th.ones(4), atol=1e-4)
         parts = []
         rngs = [np.random.default_rng(k) for k in range(4)]
-        for data in buffer.get(16, rngs):
+        for data in buffer.get(16, enumerate(rngs)):
             mean = model.policy.actor_mean(data.observations)
             parts.append(model._extra_losses(data, mean, data.old_log_prob)["prior_loss"])
     th.testing.assert_close(th.stack(parts).mean(dim=0), whole)

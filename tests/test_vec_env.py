@@ -21,7 +21,11 @@ from fed_envs.metadata import Family, parse_family
 from fed_envs.seeding import integer_seed
 
 # Random policies: Hopper falls after some 20 steps, so that this many steps contain many automatic resets.
-STEPS = {"bandit2d": 50, "reacher": 160, "locomotion": 250}
+STEPS = {"bandit2d": 50, "reacher": 160, "locomotion": 250, "point_maze": 910, "metaworld": 33}
+# A world that is slow to simulate has shorter episodes here.
+LIMITS = {"metaworld": 10}
+# What unfinished steps say; finished ones add to it.
+STEP_INFO = {"metaworld": ("success", "is_success"), "point_maze": ("success", "is_success")}
 
 
 def actions_for(venv: FederatedVecEnv, steps: int, seed: int = 0) -> np.ndarray:
@@ -47,8 +51,11 @@ def short(name: str, steps: int) -> Family:
 @pytest.mark.parametrize("name", fed_envs.FAMILIES)
 @pytest.mark.parametrize(("copies", "threads"), [(1, 1), (1, 2), (3, 1), (3, 2)])
 def test_equals_the_single_environments_bit_for_bit(name, copies, threads):
-    venv = FederatedVecEnv(name, copies, num_threads=threads, role=3)
-    envs = [gymnasium.make(f"fed_envs/{name}-v0", client=k) for k in range(venv.n_clients) for _ in range(copies)]
+    family = fed_envs.load_family(name)
+    limit = LIMITS.get(family.world, family.max_episode_steps)
+    venv = FederatedVecEnv(short(name, limit), copies, num_threads=threads, role=3)
+    ids = [(f"fed_envs/{name}-v0", k) for k in range(venv.n_clients) for _ in range(copies)]
+    envs = [gymnasium.make(id_, max_episode_steps=limit, client=k) for id_, k in ids]
     seeds = venv.seed(7)
     assert seeds == [integer_seed(7, 3, k, c) for k in range(venv.n_clients) for c in range(copies)]
     observations = venv.reset()
@@ -56,11 +63,13 @@ def test_equals_the_single_environments_bit_for_bit(name, copies, threads):
     singles = [env.reset(seed=seed)[0] for env, seed in zip(envs, seeds, strict=True)]
     np.testing.assert_array_equal(observations, singles)
     returns, lengths, ends = np.zeros(venv.num_envs), np.zeros(venv.num_envs, dtype=int), 0
-    for actions in actions_for(venv, STEPS[venv.family.world] // copies):
+    for actions in actions_for(venv, STEPS[family.world] // copies):
         observations, rewards, dones, infos = venv.step(actions)
         assert rewards.dtype == np.float32 and dones.dtype == bool
         for i, env in enumerate(envs):
-            observation, reward, terminated, truncated, _ = env.step(actions[i])
+            observation, reward, terminated, truncated, info = env.step(actions[i])
+            said = {key: info[key] for key in STEP_INFO.get(family.world, ())}
+            assert said.items() <= infos[i].items()
             assert rewards[i] == np.float32(reward) and dones[i] == (terminated or truncated)
             returns[i] += reward
             lengths[i] += 1
@@ -72,7 +81,7 @@ def test_equals_the_single_environments_bit_for_bit(name, copies, threads):
                 returns[i], lengths[i] = 0.0, 0
                 observation, _ = env.reset()
             else:
-                assert infos[i] == {}
+                assert infos[i] == said
             np.testing.assert_array_equal(observations[i], observation)
     venv.close()
     if not name.startswith("HalfCheetah"):
@@ -273,7 +282,7 @@ def test_own_environments_are_stepped_like_a_family():
         ({"family": "HopperHard", "clients": []}, "at least one client"),
         ({"family": "HopperHard", "n_envs_per_client": 0}, "n_envs_per_client must be at least 1"),
         ({"family": "HopperHard", "num_threads": 0}, "num_threads must be at least 1"),
-        ({"family": "Bandit2D", "render_mode": "rgb_array"}, "renders nothing"),
+        ({"family": "Bandit2D", "render_mode": "human"}, "renders rgb_array, not 'human'"),
         ({"family": []}, "one function per client"),
         ({"family": [lambda: gymnasium.make("Blackjack-v1")]}, "must be a Box"),
         ({"family": [lambda: gymnasium.make("CartPole-v1"), lambda: gymnasium.make("Pendulum-v1")]}, "share their spaces"),

@@ -6,19 +6,39 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
 #: command-line name to module and class
 ALGORITHMS: dict[str, tuple[str, str]] = {
     "local": ("sb3_fedguide.algorithms.local", "Local"),
     "fedavg": ("sb3_fedguide.algorithms.fedavg", "FedAvg"),
+    "fedprox": ("sb3_fedguide.algorithms.fedprox", "FedProx"),
+    "fedkl": ("sb3_fedguide.algorithms.fedkl", "FedKL"),
+    "fedsvrpgm": ("sb3_fedguide.algorithms.fedsvrpgm", "FedSVRPGM"),
+    "fedrl": ("sb3_fedguide.algorithms.fedrl", "FedRL"),
     "fedguide": ("sb3_fedguide.algorithms.fedguide", "FedGuide"),
     "fedguide-p": ("sb3_fedguide.algorithms.fedguide", "FedGuideP"),
     "fedguide-a": ("sb3_fedguide.algorithms.fedguide", "FedGuideA"),
 }
 
 
-def algorithm(name: str) -> type[FederatedPPO]:
+def register_algorithm(name: str, entry_point: str) -> None:
+    """Make an algorithm of one's own known by name, on the command line too (``--gym-packages``).
+
+    :param name: what ``--algo`` takes
+    :param entry_point: ``"module:Class"``, imported when it is first used
+    :raises ValueError: for a name that means something else already
+    """
+    module, _, cls = entry_point.partition(":")
+    if not module or not cls:
+        raise ValueError(f"entry_point={entry_point!r} must be 'module:Class'")
+    if ALGORITHMS.get(name, (module, cls)) != (module, cls):
+        raise ValueError(f"the name {name!r} is taken by {':'.join(ALGORITHMS[name])}; choose another")
+    ALGORITHMS[name] = (module, cls)
+
+
+def algorithm(name: str) -> type[FederatedPPO] | type[FederatedDDPG]:
     """The class of the algorithm ``name``.
 
     :raises KeyError: for an unknown name

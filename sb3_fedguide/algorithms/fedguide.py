@@ -168,12 +168,13 @@ class FedGuide(FederatedPPO):
         returns = buffer.rows(monte_carlo)
         raw = buffer.rows(buffer.raw_observations)
         if self.calibrate and self.dice_scale is None:
-            self.dice_scale = np.array(
-                [
-                    calibrate(self.dice.client_values(i, raw[i]) / deviation, returns[i])
-                    for i, deviation in enumerate(self.normalizer.reward_deviation)
-                ]
-            )
+            self.dice_scale = np.tile([1.0, 0.0], (self.n_clients, 1))
+            self.calibrated = np.zeros(self.n_clients, dtype=bool)
+        if self.dice_scale is not None:
+            for i in np.flatnonzero(self.present & ~self.calibrated).tolist():
+                deviation = self.normalizer.reward_deviation[i]
+                self.dice_scale[i] = calibrate(self.dice.client_values(i, raw[i]) / deviation, returns[i])
+                self.calibrated[i] = True
         dice = np.stack([self._dice_values(i, raw[i]) for i in range(self.n_clients)])
         online = buffer.rows(buffer.values)
         beta = self._blend_weights(returns, online, dice)
@@ -199,9 +200,10 @@ class FedGuide(FederatedPPO):
         )
         if self.critic_target == "blend":
             buffer.returns[:] = buffer.advantages + blended
-        self.logger.record("dice/beta", float(beta.mean()))
+        present = self.present
+        self.logger.record("dice/beta", float(beta[present].mean()))
         for name, values in (("online", online), ("dice", dice), ("blend", buffer.rows(blended))):
-            self.logger.record(f"dice/explained_variance_{name}", float(explained_variances(values, returns).mean()))
+            self.logger.record(f"dice/explained_variance_{name}", float(explained_variances(values, returns)[present].mean()))
 
     def _dice_values(self, index: int, raw_obs: np.ndarray) -> np.ndarray:
         """V_phi of one client at raw observations ``(batch, obs_dim)``, in the scale of its rewards, ``(batch,)``."""
@@ -247,7 +249,7 @@ class FedGuide(FederatedPPO):
         weights = np.zeros((self.n_clients, buffer.n_rows), dtype=np.float32)
         n_states = min(self.prior_states or buffer.n_rows, buffer.n_rows)
         sizes = []
-        for i, rng in enumerate(self.streams(Role.PRIOR)):
+        for i, rng in self.present_streams(Role.PRIOR):
             chosen = np.sort(rng.choice(buffer.n_rows, n_states, replace=False))
             log_prior = mixture_log_prob(
                 self.prior,
@@ -269,19 +271,13 @@ class FedGuide(FederatedPPO):
         """One action per visited state from the mixture."""
         assert self.prior is not None and self.experts is not None
         raw = self.rollout_buffer.rows(self.rollout_buffer.raw_observations)
-        drawn = [
-            mixture_sample(
-                self.prior,
-                self.experts[i],
-                self.mixture_rows[i],
-                th.as_tensor(raw[i]),
-                rng,
-                n_steps=self.sampling_steps,
+        drawn = th.zeros(self.n_clients, self.rollout_buffer.n_rows, self.action_space.shape[0])  # type: ignore[index]
+        for i, rng in self.present_streams(Role.PRIOR):
+            drawn[i] = mixture_sample(
+                self.prior, self.experts[i], self.mixture_rows[i], th.as_tensor(raw[i]), rng, n_steps=self.sampling_steps
             )
-            for i, rng in enumerate(self.streams(Role.PRIOR))
-        ]
         low, high = th.as_tensor(self.action_space.low), th.as_tensor(self.action_space.high)  # type: ignore[attr-defined]
-        self.rollout_buffer.extras["prior_actions"] = th.clamp(th.stack(drawn), low, high).to(self.device)
+        self.rollout_buffer.extras["prior_actions"] = th.clamp(drawn, low, high).to(self.device)
 
     def _extra_losses(self, data: FederatedSamples, mean: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
         losses = {}
@@ -304,11 +300,11 @@ class FedGuide(FederatedPPO):
         raw, advantages = buffer.rows(buffer.raw_observations), buffer.rows(buffer.advantages)
         executed = np.clip(buffer.rows(buffer.actions), self.action_space.low, self.action_space.high)  # type: ignore
         moved = np.zeros(self.n_clients)
-        for i, rng in enumerate(self.streams(Role.HEAD)):
+        for i, rng in self.present_streams(Role.HEAD):
             head = self.adaptation.refit(self.prior, i, raw[i], executed[i], advantages[i], rng)
             moved[i] = np.linalg.norm(head - self.heads[i]) / np.linalg.norm(self.heads[i])
             self.heads[i] = head
-        self.logger.record("prior/head_change", float(moved.mean()))
+        self.logger.record("prior/head_change", float(moved[self.present].mean()))
 
 
 class FedGuideP(FedGuide):

@@ -62,6 +62,7 @@ def policies(model: FederatedPPO) -> Policies:
 class PolicySnapshot(RoundCallback):
     """Keeps the deployed policies of the last round, which an exchange may replace afterwards."""
 
+    model: FederatedPPO
     deployed: Policies
 
     def _on_local_training_end(self) -> None:

@@ -27,6 +27,8 @@ def train_parser(prog: str) -> OneLineParser:
     flag = parser.add_argument
     flag("--algo", default="fedguide", metavar="ALGO", help=", ".join(ALGORITHMS))
     flag("--env", metavar="FAMILY", help="family of client environments, e.g. HopperHard")
+    flag("--gym-packages", nargs="+", action="extend", default=[], metavar="MODULE", help="modules to import first, which "
+         "register algorithms or environments of your own")  # fmt: skip
     flag("--metadata", metavar="FILE", help="metadata file of a family of your own (python -m fed_envs.metadata generate)")
     flag("--dataset", metavar="ID", help="Minari dataset, id or path, instead of data made on the spot; '{client}' in it "
          "stands for the client's number")  # fmt: skip

@@ -19,6 +19,7 @@ from sb3_fedguide.cli.names import check_names, nearest
 
 if TYPE_CHECKING:
     from fed_envs import Family
+    from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
 #: Name of a configuration to the folder inside ``zoo_configs`` that holds it.
@@ -27,7 +28,7 @@ CONFIGURATIONS = {"tuned": ".", "paper": "paper"}
 #: Families whose settings a user's own family on the same backbone starts from.
 BACKBONE_FAMILIES = {
     "Bandit2D": "Bandit2D", "Reacher-v5": "Reacher", "Hopper-v5": "Hopper", "Walker2d-v5": "Walker2D",
-    "HalfCheetah-v5": "HalfCheetah",
+    "HalfCheetah-v5": "HalfCheetah", "MetaWorld-v3": "MetaWorld10", "PointMaze-v3": "PointMaze",
 }  # fmt: skip
 
 DEFAULT = "default"
@@ -70,7 +71,7 @@ class Config:
     def n_rounds(self) -> int:
         return self.values["n_rounds"]
 
-    def make(self, env: Any, **arguments: Any) -> FederatedPPO:
+    def make(self, env: Any, **arguments: Any) -> FederatedPPO | FederatedDDPG:
         """Construct the algorithm.
 
         :param env: whatever a federation can be made of
@@ -78,7 +79,7 @@ class Config:
         :raises ValueError: where the values do not fit together
         """
         values = {name: schema.schedule_or_value(value) for name, value in self.values.items() if name != "n_rounds"}
-        network = schema.NetworkConfig.model_validate(values.pop("policy_kwargs"))
+        network = schema.network_config(algorithm(self.algo)).model_validate(values.pop("policy_kwargs"))
         policy = values.pop("policy")
         with warnings.catch_warnings():
             # SB3 compares a client's batch_size with the steps of all clients; FederatedPPO has checked it against its own.
@@ -123,7 +124,10 @@ def resolve(
     if n_timesteps is not None:
         if n_timesteps < 1:
             raise ValueError(f"n_timesteps={n_timesteps} must be at least 1; it counts the steps of all clients together")
-        values["n_rounds"] = math.ceil(n_timesteps / (values["rollout_size"] * family.n_clients))
+        from sb3_fedguide.common.participation import n_participants
+
+        present = n_participants(values["client_fraction"], family.n_clients)
+        values["n_rounds"] = math.ceil(n_timesteps / (values["rollout_size"] * present))
     return Config(algo, applied, values)
 
 
@@ -145,7 +149,7 @@ def complete(given: Mapping[str, Any], algo: str) -> dict[str, Any]:
     for name, (hint, default) in parameters.items():
         if name not in NESTED:
             values[name] = schema.check_value(name, given[name], hint) if name in given else default
-    network = schema.check_model("policy_kwargs", schema.NetworkConfig, given.get("policy_kwargs") or {}, {})
+    network = schema.check_model("policy_kwargs", schema.network_config(algorithm(algo)), given.get("policy_kwargs") or {}, {})
     offline = schema.check_model("pretraining", PretrainingConfig, given.get("pretraining") or {}, _SET_ELSEWHERE)
     values["policy_kwargs"] = network.model_dump(mode="json")
     values["pretraining"] = offline.model_dump(mode="json", exclude=set(_SET_ELSEWHERE))
@@ -161,7 +165,8 @@ def config_path(conf_file: str, algo: str) -> Path:
         import zoo_configs
 
         folder = Path(next(iter(zoo_configs.__path__)))
-        return folder / CONFIGURATIONS[conf_file] / f"{algo}.yml"
+        path = folder / CONFIGURATIONS[conf_file] / f"{algo}.yml"
+        return path if path.is_file() else _inherited_path(path, algo)
     path = Path(conf_file)
     if not path.is_file():
         hint = "" if path.suffix else nearest(conf_file, CONFIGURATIONS)
@@ -169,6 +174,20 @@ def config_path(conf_file: str, algo: str) -> Path:
             f"no configuration {conf_file!r}.{hint} Give {' or '.join(CONFIGURATIONS)}, or the path of a YAML file"
         )
     return path
+
+
+def _inherited_path(path: Path, algo: str) -> Path:
+    """An algorithm of the user's own has no file here; it takes the settings of the nearest class that has one."""
+    from sb3_fedguide.common.federated_ppo import FederatedPPO
+
+    for base in algorithm(algo).__mro__:
+        for name, (module, cls) in ALGORITHMS.items():
+            candidate = path.with_name(f"{name}.yml")
+            if (base.__module__, base.__name__) == (module, cls) and candidate.is_file():
+                return candidate
+    if issubclass(algorithm(algo), FederatedPPO):
+        return path.with_name("local.yml")  # plain PPO, whatever the algorithm adds
+    raise ValueError(f"there are no settings for {algo}; give a YAML file with -conf")
 
 
 def read_config(path: Path) -> dict[str, dict[str, Any]]:

@@ -95,8 +95,10 @@ def _run(folder: Path, configs: dict[str, Config], seed: int, progress: bool) ->
 def _train(name: str, config: Config, family: Family, seed: int, progress: bool) -> tuple[FederatedPPO, MethodResult]:
     from sb3_fedguide.benchmark.bandit2d import MethodResult, PolicySnapshot, policies
     from sb3_fedguide.cli.recorder import RunEvalCallback
+    from sb3_fedguide.common.federated_ppo import FederatedPPO
 
     model = config.make(family, seed=seed)
+    assert isinstance(model, FederatedPPO)
     evaluation, snapshot = RunEvalCallback(config.n_rounds, eval_freq=1), PolicySnapshot()
     total = config.n_rounds * model.rollout_size * model.n_clients
     model.learn(total, [evaluation, snapshot], progress_bar=progress)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import OneLineParser
+from sb3_fedguide.cli.train import import_packages
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,6 +34,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide evaluate") -> 
     parser = _parser(prog)
     arguments = parser.parse_args(argv)
     try:
+        import_packages(arguments.gym_packages)
         _check(arguments)
         run, family = _read_run(Path(arguments.run))
         model = _load(Path(arguments.run), run, family)
@@ -64,6 +66,8 @@ def _parser(prog: str) -> OneLineParser:
          "local training, what the server sent after it, or both where they differ")  # fmt: skip
     flag("--episodes", type=int, default=10, metavar="N", help="episodes per client")
     flag("--seed", type=int, default=EVALUATION_SEED, help="of the episodes; the default is that of training's evaluations")
+    flag("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first, which register algorithms "
+         "of your own")  # fmt: skip
     flag("--stochastic", action="store_true", help="sample actions instead of taking their mean")
     flag("-o", "--output", metavar="FILE", help="write the JSON there instead of to the terminal")
     flag("--video", metavar="DIR", help="write one animated picture (GIF) of each client's first episode there")
@@ -184,6 +188,7 @@ def _numbers(evaluation: Evaluation) -> dict[str, Any]:
         "worst_client": evaluation.worst_client,
         "client_returns": evaluation.client_returns.tolist(),
         "client_return_std": evaluation.returns.std(axis=1).tolist(),
+        "success_rates": evaluation.success_rates.tolist() if evaluation.success_rates is not None else None,
         "client_lengths": evaluation.lengths.mean(axis=1).tolist(),
         "returns": evaluation.returns.tolist(),
     }

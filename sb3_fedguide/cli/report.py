@@ -10,11 +10,11 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from sb3_fedguide.cli.recorder import CostCallback, RunEvalCallback
-    from sb3_fedguide.common.federated_ppo import FederatedPPO
+    from sb3_fedguide.common.federation import Federation
 
 
 def summarize(
-    model: FederatedPPO,
+    model: Federation,
     costs: CostCallback,
     evaluation: RunEvalCallback | None,
     pretraining_seconds: float,
@@ -50,6 +50,7 @@ def summarize(
             "client_lengths": [float(value) for value in evaluated[policy].lengths.mean(axis=1)],
             "average": evaluated[policy].average,
             "worst_client": evaluated[policy].worst_client,
+            "success_rates": rates.tolist() if (rates := evaluated[policy].success_rates) is not None else None,
             "n_episodes": int(evaluated[policy].returns.shape[1]),
             "curve": [list(point) for point in evaluation.curves[policy]] if evaluation is not None else [],
         }

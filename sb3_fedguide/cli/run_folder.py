@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 #: Parameters of the policies before the last exchange.
 DEPLOYED = "deployed.npz"
 PACKAGES = (
-    "sb3-fedguide", "stable-baselines3", "gymnasium", "gymnasium-robotics", "mujoco", "torch", "numpy", "scipy", "POT",
-    "minari", "pydantic", "tensorboard",
+    "sb3-fedguide", "stable-baselines3", "gymnasium", "gymnasium-robotics", "metaworld", "mujoco", "torch", "numpy", "scipy",
+    "POT", "minari", "pydantic", "tensorboard",
 )  # fmt: skip
 
 

@@ -42,6 +42,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "rollout_size": (2, math.inf),
     "stats_window_size": (1, math.inf),
     "bc_weight": (0, 1),
+    "client_fraction": (_OPEN, 1),
     "beta": (0, 1),
     "n_experts": (1, math.inf),
     "eta": (_OPEN, math.inf),
@@ -51,6 +52,17 @@ RANGES: dict[str, tuple[float, float]] = {
     "adapt_temperature": (_OPEN, math.inf),
     "adapt_weight": (0, 1),
     "average_until": (1, math.inf),
+    "buffer_size": (1, math.inf),
+    "learning_starts": (0, math.inf),
+    "tau": (_OPEN, 1),
+    "train_freq": (1, math.inf),
+    "noise_theta": (0, math.inf),
+    "noise_sigma": (0, math.inf),
+    "noise_dt": (_OPEN, math.inf),
+    "mu": (0, math.inf),
+    "lambda_global": (0, math.inf),
+    "lambda_local": (0, math.inf),
+    "reference_every": (1, math.inf),
 }
 
 ACTIVATIONS = {"tanh": "Tanh", "relu": "ReLU", "elu": "ELU", "leaky_relu": "LeakyReLU", "silu": "SiLU"}
@@ -86,6 +98,41 @@ class NetworkConfig(pydantic.BaseModel):
         kwargs = self.model_dump(exclude_none=True)
         kwargs["activation_fn"] = getattr(nn, ACTIVATIONS[self.activation_fn])
         return kwargs
+
+
+class DeterministicNetworkConfig(pydantic.BaseModel):
+    """``policy_kwargs`` of a deterministic policy as plain data.
+
+    :param net_arch: hidden layers of actor and critic, ``[64, 64]`` or ``{pi: [64, 64], qf: [64, 64]}``
+    :param activation_fn: by name
+    """
+
+    model_config = pydantic.ConfigDict(extra="forbid", strict=True)
+
+    net_arch: list[pydantic.PositiveInt] | dict[Literal["pi", "qf"], list[pydantic.PositiveInt]] | None = None
+    activation_fn: Literal["tanh", "relu", "elu", "leaky_relu", "silu"] = "relu"
+
+    @pydantic.field_validator("net_arch", mode="after")
+    @classmethod
+    def _both_networks(cls, value: Any) -> Any:
+        if isinstance(value, dict) and set(value) != {"pi", "qf"}:
+            raise ValueError("needs both pi and qf")
+        return value
+
+    def to_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of SB3's policy."""
+        from torch import nn
+
+        kwargs = self.model_dump(exclude_none=True)
+        kwargs["activation_fn"] = getattr(nn, ACTIVATIONS[self.activation_fn])
+        return kwargs
+
+
+def network_config(algorithm: type) -> type[NetworkConfig] | type[DeterministicNetworkConfig]:
+    """The model of an algorithm's ``policy_kwargs``."""
+    from sb3_fedguide.common.federated_ddpg import FederatedDDPG
+
+    return DeterministicNetworkConfig if issubclass(algorithm, FederatedDDPG) else NetworkConfig
 
 
 def hyperparameters(algorithm: type) -> dict[str, tuple[Any, Any]]:

@@ -6,6 +6,7 @@ Nothing is created on disk, and neither PyTorch nor the simulator is imported, b
 from __future__ import annotations
 
 import argparse
+import importlib
 import shlex
 import sys
 import time
@@ -20,6 +21,7 @@ from sb3_fedguide.cli.names import check_names
 if TYPE_CHECKING:
     from fed_envs import Family
     from sb3_fedguide.cli.config import Config
+    from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
 EXIT_USAGE = 2
@@ -35,6 +37,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
     arguments = parse_train(argv, prog)
     command = shlex.join(sys.orig_argv if argv is None else [prog, *argv])
     try:
+        import_packages(arguments.gym_packages)
         family = find_family(arguments)
         _check_before_imports(arguments)
         run = prepare(arguments, family, command)
@@ -45,6 +48,20 @@ def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
         print(f"{prog}: interrupted before the run began", file=sys.stderr)
         return EXIT_INTERRUPTED
     return run()
+
+
+def import_packages(modules: Sequence[str]) -> None:
+    """Import the user's modules, from the current folder too.
+
+    :raises ValueError: for one that cannot be imported
+    """
+    if modules and "" not in sys.path:
+        sys.path.insert(0, "")
+    for module in modules:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise ValueError(f"--gym-packages {module}: {error}") from None
 
 
 def find_family(arguments: argparse.Namespace) -> Family:
@@ -114,7 +131,12 @@ class Run:
     """A run whose inputs are all known to be sound; calling it trains."""
 
     def __init__(
-        self, arguments: argparse.Namespace, command: str, config: Config, family: Family, model: FederatedPPO
+        self,
+        arguments: argparse.Namespace,
+        command: str,
+        config: Config,
+        family: Family,
+        model: FederatedPPO | FederatedDDPG,
     ) -> None:
         self.arguments, self.command, self.config, self.family, self.model = arguments, command, config, family, model
 
@@ -189,7 +211,7 @@ class Run:
             raise OfflineStageError(str(error)) from error
         self._pretraining_seconds = time.perf_counter() - self._started
         model.learn(
-            self.config.n_rounds * model.rollout_size * model.n_clients,
+            self.config.n_rounds * model.rollout_size * model.n_participants,
             [callback for callback in (self._evaluation, self._costs, self._deployed) if callback is not None],
             progress_bar=arguments.progress,
         )

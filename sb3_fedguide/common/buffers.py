@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,16 @@ class FederatedSamples(NamedTuple):
     advantages: th.Tensor
     returns: th.Tensor
     extras: dict[str, th.Tensor]
+
+
+def check_sizes(rollout_size: int, batch_size: int, n_envs_per_client: int) -> None:
+    """:raises ValueError: for sizes of a client's rollout that do not fit together"""
+    if rollout_size % n_envs_per_client:
+        raise ValueError(
+            f"n_envs_per_client={n_envs_per_client} must divide rollout_size={rollout_size}, the steps per client and round"
+        )
+    if not 1 < batch_size <= rollout_size:
+        raise ValueError(f"batch_size={batch_size} must lie between 2 and rollout_size={rollout_size}; both are per client")
 
 
 def generalized_advantage(
@@ -133,10 +143,16 @@ class FederatedRolloutBuffer:
         return rewards
 
     def get(
-        self, batch_size: int, rngs: list[np.random.Generator], device: th.device | str = "cpu"
+        self, batch_size: int, rngs: Iterable[tuple[int, np.random.Generator]], device: th.device | str = "cpu"
     ) -> Iterator[FederatedSamples]:
-        """One epoch of minibatches; every client's order comes from its own generator."""
-        order = th.as_tensor(np.stack([rng.permutation(self.n_rows) for rng in rngs]), device=device)
+        """One epoch of minibatches.
+
+        :param rngs: position and generator of each client that trains: its rows' order; the others' rows stay in theirs
+        """
+        rows = np.tile(np.arange(self.n_rows), (self.n_clients, 1))
+        for index, rng in rngs:
+            rows[index] = rng.permutation(self.n_rows)
+        order = th.as_tensor(rows, device=device)
         client = th.arange(self.n_clients, device=device).unsqueeze(1)
         arrays = (self.observations, self.actions, self.values, self.log_probs, self.advantages, self.returns)
         tensors = [th.as_tensor(self.rows(array), device=device)[client, order] for array in arrays]

@@ -11,26 +11,32 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Event
 from tqdm import tqdm
 
 if TYPE_CHECKING:
-    from sb3_fedguide.common.federated_ppo import FederatedPPO
+    from sb3_fedguide.common.federation import Federation
 
 
 class RoundCallback(BaseCallback):
-    """A callback with two more events: after local training, and after the exchange that ends a round.
+    """A callback with three more events: before a round, after local training, and after the exchange that ends the round.
 
     Between the two, a method that shares its policy replaces the clients' own parameters: what a client would deploy is
     seen in :meth:`_on_training_step_end`, what the server broadcast in :meth:`_on_round_end`.
     """
 
-    model: FederatedPPO
+    model: Federation  # type: ignore[assignment]
 
     def _on_step(self) -> bool:
         return True
+
+    def on_round_start(self) -> None:
+        self._on_round_start()
 
     def on_local_training_end(self) -> None:
         self._on_local_training_end()
 
     def on_round_end(self) -> None:
         self._on_round_end()
+
+    def _on_round_start(self) -> None:
+        """Before the rollout; who takes part is known."""
 
     def _on_local_training_end(self) -> None:
         """After ``train()``, before the exchange."""
@@ -68,6 +74,14 @@ class ExchangeCallback(RoundCallback):
         while strategy is not None and strategy.needs_setup:
             self._exchange()
 
+    def _on_round_start(self) -> None:
+        model = self.model
+        for index in np.flatnonzero(model.present & model.outdated).tolist():
+            broadcast = model.strategy.latest(model.client_ids[index]) if model.strategy is not None else {}
+            model.receive(index, broadcast)
+            model.outdated[index] = False
+            self.bytes_down += payload_bytes({index: broadcast})
+
     def _on_round_end(self) -> None:
         if self.model.strategy is not None:
             self._exchange()
@@ -76,10 +90,12 @@ class ExchangeCallback(RoundCallback):
         model, strategy = self.model, self.model.strategy
         assert strategy is not None
         started = time.perf_counter()
-        uploads = {client: model.upload(index) for index, client in enumerate(model.client_ids)}
+        present = {client: index for index, client in enumerate(model.client_ids) if model.present[index]}
+        uploads = {client: model.upload(index) for client, index in present.items()}
         broadcasts = strategy.aggregate(model.round, uploads)
-        for index, client in enumerate(model.client_ids):
+        for client, index in present.items():
             model.receive(index, broadcasts[client])
+        model.outdated |= ~model.present
         up, down = payload_bytes(uploads), payload_bytes(broadcasts)
         self.bytes_up += up
         self.bytes_down += down
@@ -105,7 +121,7 @@ class RoundProgressCallback(RoundCallback):
         self.bar: Any = None
 
     def _on_training_start(self) -> None:
-        per_round = self.model.rollout_size * self.model.n_clients
+        per_round = self.model.rollout_size * self.model.n_participants
         remaining = max(0, self.total_timesteps - self.model.num_timesteps)
         self.bar = tqdm(total=-(-remaining // per_round), desc=type(self.model).__name__, unit="round", dynamic_ncols=True)
 

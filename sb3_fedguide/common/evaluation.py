@@ -25,10 +25,13 @@ class Evaluation:
 
     :param returns: undiscounted raw returns, ``(n_clients, n_episodes)``
     :param lengths: steps, ``(n_clients, n_episodes)``
+    :param successes: whether each episode succeeded, ``(n_clients, n_episodes)`` bool; ``None`` where the environments do not
+        say
     """
 
     returns: np.ndarray
     lengths: np.ndarray
+    successes: np.ndarray | None = None
 
     @property
     def client_returns(self) -> np.ndarray:
@@ -39,6 +42,11 @@ class Evaluation:
     def average(self) -> float:
         """The client-average return: the measure F where the round is the last."""
         return float(self.client_returns.mean())
+
+    @property
+    def success_rates(self) -> np.ndarray | None:
+        """Share of each client's episodes that succeeded, ``(n_clients,)``; ``None`` where the environments do not say."""
+        return None if self.successes is None else self.successes.mean(axis=1)
 
     @property
     def worst_client(self) -> float:
@@ -65,13 +73,17 @@ def evaluate_federation(
     env.active[:] = True
     obs: Any = env.reset()
     returns, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)
+    successes: dict[int, bool] = {}
     while env.active.any():
         obs, _, dones, infos = env.step(predict(obs))
         for index in np.flatnonzero(dones):
             returns[index], lengths[index] = infos[index]["episode"]["r"], infos[index]["episode"]["l"]
+            if "is_success" in infos[index]:
+                successes[int(index)] = bool(infos[index]["is_success"])
         env.active[dones] = False
     shape = (env.n_clients, env.n_envs_per_client)
-    return Evaluation(returns.reshape(shape), lengths.reshape(shape))
+    succeeded = np.array([successes[index] for index in range(env.num_envs)]).reshape(shape) if successes else None
+    return Evaluation(returns.reshape(shape), lengths.reshape(shape), succeeded)
 
 
 class FederatedEvalCallback(RoundCallback):
@@ -108,7 +120,7 @@ class FederatedEvalCallback(RoundCallback):
     def _on_training_start(self) -> None:
         self.env = evaluation_env(self.model, self.n_episodes)
         if self.csv_path is not None and not self.csv_path.exists():
-            header = ("round", "timesteps", "policy", "client", "mean_return", "std_return", "mean_length")
+            header = ("round", "timesteps", "policy", "client", "mean_return", "std_return", "mean_length", "success_rate")
             with self.csv_path.open("w", newline="") as file:
                 csv.writer(file).writerow(header)
 
@@ -121,6 +133,10 @@ class FederatedEvalCallback(RoundCallback):
             self.logger.record("eval/mean_ep_length", float(evaluation.lengths.mean()))
             for client, value in zip(self.model.client_ids, evaluation.client_returns, strict=True):
                 self.model.record_client(client, "eval_mean_reward", float(value))
+            if evaluation.success_rates is not None:
+                self.logger.record("eval/success_rate", float(evaluation.success_rates.mean()))
+                for client, value in zip(self.model.client_ids, evaluation.success_rates, strict=True):
+                    self.model.record_client(client, "eval_success_rate", float(value))
 
     def _on_round_end(self) -> None:
         round = self.model.round
@@ -141,8 +157,10 @@ class FederatedEvalCallback(RoundCallback):
         return evaluation
 
     def _rows(self, policy: str, round: int, evaluation: Evaluation) -> list[tuple[Any, ...]]:
-        clients = zip(self.model.client_ids, evaluation.returns, evaluation.lengths, strict=True)
+        rates = evaluation.success_rates
+        success = [""] * len(evaluation.returns) if rates is None else [f"{rate:.6g}" for rate in rates]
+        clients = zip(self.model.client_ids, evaluation.returns, evaluation.lengths, success, strict=True)
         return [
-            (round, self.model.num_timesteps, policy, client, f"{r.mean():.6g}", f"{r.std():.6g}", f"{n.mean():.6g}")
-            for client, r, n in clients
+            (round, self.model.num_timesteps, policy, client, f"{r.mean():.6g}", f"{r.std():.6g}", f"{n.mean():.6g}", rate)
+            for client, r, n, rate in clients
         ]

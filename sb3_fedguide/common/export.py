@@ -5,13 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import PPO
+from stable_baselines3 import DDPG, PPO
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
+from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.policies import StackedMlpPolicy
+
 if TYPE_CHECKING:
+    from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federation import Federation
 
 
@@ -62,10 +68,27 @@ class DeployedPolicy(nn.Module):
 
 def export_client(federation: Federation, index: int, path: str | Path) -> None:
     """Write the policy of the client at position ``index`` as a ``torch.export`` program."""
-    policy = DeployedPolicy(client_model(federation, index)).eval().requires_grad_(False)
-    example = th.zeros(2, federation.observation_space.shape[0])  # type: ignore[index]
+    export_program(DeployedPolicy(client_model(federation, index)), federation.observation_space.shape[0], path)  # type: ignore[index]
+
+
+def export_program(policy: nn.Module, obs_dim: int, path: str | Path) -> None:
+    """Write ``policy``, which maps ``(batch, obs_dim)`` to actions, as a ``torch.export`` program for any batch size."""
+    example = th.zeros(2, obs_dim)
     batch = {0: th.export.Dim("batch")}
-    th.export.save(th.export.export(policy, (example,), dynamic_shapes=(batch,)), path)
+    th.export.save(th.export.export(policy.eval().requires_grad_(False), (example,), dynamic_shapes=(batch,)), path)
+
+
+def normalized_features(normalizer: FederatedNormalizer, index: int) -> dict[str, Any]:
+    """What builds the normalisation of the client at position ``index`` into its policy; nothing where there is none."""
+    if not normalizer.norm_obs:
+        return {}
+    kwargs = {
+        "mean": normalizer.obs.mean[index].tolist(),
+        "var": normalizer.obs.var[index].tolist(),
+        "epsilon": normalizer.EPSILON,
+        "clip": normalizer.CLIP,
+    }
+    return {"features_extractor_class": NormalizedObservation, "features_extractor_kwargs": kwargs}
 
 
 def client_model(federation: Federation, index: int) -> PPO:
@@ -74,20 +97,13 @@ def client_model(federation: Federation, index: int) -> PPO:
     Policy, critic and normalisation are copied; Adam's moments are not, so that further training starts fresh.
     """
     policy = federation.policy
+    assert isinstance(policy, StackedMlpPolicy)
     policy_kwargs: dict[str, Any] = {
         "net_arch": policy.net_arch,
         "activation_fn": policy.activation_fn,
         "log_std_init": policy.log_std_init,
+        **normalized_features(federation.normalizer, index),
     }
-    normalizer = federation.normalizer
-    if normalizer.norm_obs:
-        policy_kwargs["features_extractor_class"] = NormalizedObservation
-        policy_kwargs["features_extractor_kwargs"] = {
-            "mean": normalizer.obs.mean[index].tolist(),
-            "var": normalizer.obs.var[index].tolist(),
-            "epsilon": normalizer.EPSILON,
-            "clip": normalizer.CLIP,
-        }
     settings = {name: getattr(federation, name) for name in ("n_steps", "batch_size", "gamma", "gae_lambda", "n_epochs")}
     model = PPO(
         "MlpPolicy",
@@ -104,4 +120,35 @@ def client_model(federation: Federation, index: int) -> PPO:
     model._setup_model()
     state = policy.client_state_dict(index)
     model.policy.load_state_dict({**model.policy.state_dict(), **state})
+    return model
+
+
+def client_ddpg(federation: FederatedDDPG, index: int) -> DDPG:
+    """As :func:`client_model`, of a federation of deterministic policies: the networks and their targets are copied."""
+    policy = federation.policy
+    zeros = np.zeros(federation.action_space.shape or ())
+    settings: dict[str, Any] = {
+        name: getattr(federation, name)
+        for name in ("buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq", "gradient_steps")
+    }
+    noise = federation.noise
+    model = DDPG(
+        "MlpPolicy",
+        None,  # type: ignore[arg-type]
+        learning_rate=federation.learning_rate,
+        action_noise=OrnsteinUhlenbeckActionNoise(zeros, np.full_like(zeros, noise.sigma), noise.theta, noise.dt),
+        policy_kwargs={
+            "net_arch": policy.net_arch,
+            "activation_fn": policy.activation_fn,
+            **normalized_features(federation.normalizer, index),
+        },
+        seed=federation.seed,
+        device="cpu",
+        _init_setup_model=False,
+        **settings,
+    )
+    model.observation_space, model.action_space = federation.observation_space, federation.action_space
+    model.n_envs = 1
+    model._setup_model()
+    model.policy.load_state_dict({**model.policy.state_dict(), **policy.client_state_dict(index)})
     return model

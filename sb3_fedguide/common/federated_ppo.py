@@ -18,10 +18,11 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide.common import gaussian
-from sb3_fedguide.common.buffers import FederatedRolloutBuffer, FederatedSamples, generalized_advantage
+from sb3_fedguide.common.buffers import FederatedRolloutBuffer, FederatedSamples, check_sizes, generalized_advantage
 from sb3_fedguide.common.callbacks import round_callbacks
 from sb3_fedguide.common.federation import Federation, FederationLike, PolicyLike, as_federated_env
 from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.policies import StackedMlpPolicy
 from sb3_fedguide.common.seeding import Role, integer_seed
 from sb3_fedguide.common.stacked import clip_grad_norm_per_client
@@ -50,6 +51,7 @@ class FederatedPPOArguments(TypedDict, total=False):
     clients: Sequence[int] | None
     normalize: bool
     bc_weight: float
+    client_fraction: float
     pretraining: PretrainingConfig | dict[str, Any] | None
     cache_dir: str | Path | None
     stats_window_size: int
@@ -85,6 +87,8 @@ class FederatedPPO(Federation, PPO):
     :param clients: ids of the clients that live here; all by default
     :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client
     :param bc_weight: alpha of ``theta_0 = (1 - alpha) theta_rand + alpha theta_BC`` for the actor (paper: 0.3)
+    :param client_fraction: share of the clients that take part in each round, drawn by the server; the others keep all of
+        their state, and receive what they missed before they train again
     :param pretraining: settings of the offline stage, a ``PretrainingConfig`` or a dict of its fields
     :param cache_dir: where the offline stage keeps its results; by default the user's cache folder
     :param stats_window_size: finished episodes per client over which returns are averaged
@@ -117,6 +121,7 @@ class FederatedPPO(Federation, PPO):
         clients: Sequence[int] | None = None,
         normalize: bool = False,
         bc_weight: float = 0.0,
+        client_fraction: float = 1.0,
         pretraining: PretrainingConfig | dict[str, Any] | None = None,
         cache_dir: str | Path | None = None,
         stats_window_size: int = 100,
@@ -128,8 +133,8 @@ class FederatedPPO(Federation, PPO):
         _init_setup_model: bool = True,
     ) -> None:
         env = as_federated_env(env, n_envs_per_client, clients)
-        self._init_federation(env, normalize, bc_weight, pretraining, cache_dir)
-        _check_sizes(rollout_size, batch_size, self.n_envs_per_client)
+        self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction)
+        check_sizes(rollout_size, batch_size, self.n_envs_per_client)
         self.rollout_size = rollout_size
         with warnings.catch_warnings():
             # SB3 takes the clients' rollouts for one and compares its size with a client's minibatch.
@@ -172,6 +177,8 @@ class FederatedPPO(Federation, PPO):
             self.action_space,  # type: ignore[arg-type]
         )
         kwargs = {**self.policy_kwargs, "n_clients": self.n_clients, "init_seed": integer_seed(self.seed, Role.INIT)}
+        if self.n_participants < self.n_clients:
+            kwargs.update(optimizer_class=ParticipationAdam, optimizer_kwargs={"eps": 1e-5})  # SB3's epsilon for Adam
         self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs).to(self.device)  # type: ignore
         self.clip_range: Schedule = FloatSchedule(self.clip_range)
         self.clip_range_vf: Schedule | None = None if self.clip_range_vf is None else FloatSchedule(self.clip_range_vf)
@@ -229,6 +236,9 @@ class FederatedPPO(Federation, PPO):
         callbacks.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
             started = time.perf_counter()
+            self._draw_participants()
+            for hook in rounds:
+                hook.on_round_start()
             if not self.collect_rollouts(self.env, callbacks, self.rollout_buffer, self.n_steps):  # type: ignore[arg-type]
                 break
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
@@ -260,6 +270,7 @@ class FederatedPPO(Federation, PPO):
         raw_obs = self._last_obs.reshape(*shape, -1)  # type: ignore[union-attr]
         obs = self.normalizer.normalize_obs(raw_obs)
         starts = self._last_episode_starts.reshape(shape)
+        present = None if self.present.all() else self.present
         dones = starts
         for step in range(n_rollout_steps):
             with th.no_grad():
@@ -267,19 +278,21 @@ class FederatedPPO(Federation, PPO):
             actions = mean + noise[step]
             flat_actions = np.clip(actions, low, high).reshape(env.num_envs, -1)
             new_raw_obs, raw_rewards, flat_dones, infos = env.step(flat_actions)
-            self.num_timesteps += env.num_envs
+            self.num_timesteps += int(env.active.sum())
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
             dones = flat_dones.reshape(shape)
             next_raw = new_raw_obs.reshape(*shape, -1)  # type: ignore[union-attr]
-            self.normalizer.update_obs(next_raw)
-            rewards = self.normalizer.scale_reward(raw_rewards.reshape(shape), dones)
+            self.normalizer.update_obs(next_raw, present)
+            rewards = self.normalizer.scale_reward(raw_rewards.reshape(shape), dones, present)
             rollout_buffer.add(raw_obs, obs, actions, rewards, starts)
             for index in np.flatnonzero(flat_dones):
                 self._end_episode(int(index), infos[index])
             raw_obs, obs, starts = next_raw, self.normalizer.normalize_obs(next_raw), dones
-        self._last_obs, self._last_episode_starts = new_raw_obs, flat_dones  # type: ignore[assignment]
+            if present is not None:  # a client that was away still has its episode to begin
+                starts = np.where(present[:, None], dones, rollout_buffer.episode_starts[step] > 0)
+        self._last_obs, self._last_episode_starts = new_raw_obs, np.asarray(starts, dtype=bool).reshape(-1)  # type: ignore[assignment]
         self._finish_rollout(raw_obs, obs, dones)
         callback.update_locals(locals())
         callback.on_rollout_end()
@@ -288,9 +301,11 @@ class FederatedPPO(Federation, PPO):
     def _exploration_noise(self, n_steps: int) -> np.ndarray:
         """Every client's Gaussian noise for a whole rollout, from its own stream: ``(n_steps, n_clients, n_envs, dim)``."""
         per_client = (n_steps, self.n_envs_per_client, self.action_space.shape[0])  # type: ignore[index]
-        draws = [rng.standard_normal(per_client, dtype=np.float32) for rng in self.streams(Role.ACTION)]
+        draws = np.zeros((n_steps, self.n_clients, *per_client[1:]), dtype=np.float32)
+        for index, rng in self.present_streams(Role.ACTION):
+            draws[:, index] = rng.standard_normal(per_client, dtype=np.float32)
         std = self.policy.log_std.detach().exp().cpu().numpy()
-        return np.stack(draws, axis=1) * std[None, :, None]
+        return draws * std[None, :, None]
 
     def _end_episode(self, index: int, info: dict[str, Any]) -> None:
         client, env = divmod(index, self.n_envs_per_client)
@@ -342,7 +357,7 @@ class FederatedPPO(Federation, PPO):
         statistics = RoundStatistics()
         self._prepare_training()
         for _ in range(self.n_epochs):
-            for data in self.rollout_buffer.get(self.batch_size, self.streams(Role.MINIBATCH), self.device):
+            for data in self.rollout_buffer.get(self.batch_size, self.present_streams(Role.MINIBATCH), self.device):
                 mean = self.policy.actor_mean(data.observations)
                 values = self.policy.values(data.observations)
                 log_prob = gaussian.log_prob(mean, self.policy.log_std, data.actions)
@@ -384,12 +399,3 @@ class FederatedPPO(Federation, PPO):
             self._n_updates += 1
         self._finish_training()
         record_training(self, statistics, {"clip_range": self.clip_range, "clip_range_vf": self.clip_range_vf})
-
-
-def _check_sizes(rollout_size: int, batch_size: int, n_envs_per_client: int) -> None:
-    if rollout_size % n_envs_per_client:
-        raise ValueError(
-            f"n_envs_per_client={n_envs_per_client} must divide rollout_size={rollout_size}, the steps per client and round"
-        )
-    if not 1 < batch_size <= rollout_size:
-        raise ValueError(f"batch_size={batch_size} must lie between 2 and rollout_size={rollout_size}; both are per client")

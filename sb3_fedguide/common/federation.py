@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3 import PPO
+from stable_baselines3 import DDPG, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundProgressCallback
+from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
 from sb3_fedguide.common.export import client_model, export_client
 from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.participation import draw_participants, n_participants
 from sb3_fedguide.common.policies import StackedMlpPolicy
 from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
@@ -38,7 +41,7 @@ class Federation(BaseAlgorithm):
     and its part of the offline stage with :meth:`_pretrain`.
     """
 
-    policy: StackedMlpPolicy  # type: ignore[assignment]
+    policy: StackedMlpPolicy | StackedDDPGPolicy  # type: ignore[assignment]
     normalizer: FederatedNormalizer
     rollout_size: int
     gamma: float
@@ -52,8 +55,11 @@ class Federation(BaseAlgorithm):
         bc_weight: float,
         pretraining: PretrainingConfig | dict[str, Any] | None,
         cache_dir: str | Path | None,
+        client_fraction: float = 1.0,
     ) -> None:
         """Called by a subclass's constructor, before SB3's."""
+        if not 0.0 < client_fraction <= 1.0:
+            raise ValueError(f"client_fraction={client_fraction} must lie in (0, 1]: it is the share of clients in each round")
         if not 0.0 <= bc_weight <= 1.0:
             raise ValueError(f"bc_weight={bc_weight} must lie in [0, 1]")
         self.client_ids: list[int] = [] if env is None else list(env.client_ids)
@@ -63,6 +69,11 @@ class Federation(BaseAlgorithm):
         self.bc_weight = bc_weight
         self.pretraining_config = PretrainingConfig.model_validate(pretraining or {})
         self.cache_dir = cache_dir
+        self.client_fraction = client_fraction
+        #: who takes part in the current round, ``(n_clients,)`` bool
+        self.present = np.ones(self.n_clients, dtype=bool)
+        #: who missed the last exchange and receives what the server last sent before training again
+        self.outdated = np.zeros(self.n_clients, dtype=bool)
         self.round = 0
         self.pretrained = False
         #: bytes that all clients together sent and received in the offline stage
@@ -81,6 +92,32 @@ class Federation(BaseAlgorithm):
     def n_clients(self) -> int:
         """Clients that live here."""
         return len(self.client_ids)
+
+    @property
+    def n_participants(self) -> int:
+        """Clients that take part in each round."""
+        return n_participants(self.client_fraction, self.n_clients)
+
+    def _draw_participants(self) -> None:
+        """Draw who takes part in the coming round; the others neither step nor train, and all of their state stays."""
+        if self.n_participants == self.n_clients:
+            return
+        assert self.seed is not None
+        self.present = draw_participants(self.seed, self.round, self.n_clients, self.n_participants)
+        env = self.get_env()
+        assert isinstance(env, FederatedVecEnv)
+        env.active = np.repeat(self.present, self.n_envs_per_client)
+        for optimizer in self._optimizers():
+            optimizer.present = self.present  # type: ignore[attr-defined]
+
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        """Everything that steps stacked parameters."""
+        return [self.policy.optimizer]
+
+    def present_streams(self, role: Role) -> Iterator[tuple[int, np.random.Generator]]:
+        """Position and generator of each client that takes part in the current round."""
+        for index in np.flatnonzero(self.present).tolist():
+            yield index, self.streams(role)[index]
 
     def streams(self, role: Role) -> list[np.random.Generator]:
         """Each local client's own generator for one purpose."""
@@ -125,6 +162,11 @@ class Federation(BaseAlgorithm):
         self._pretrain(stage)
         self.pretrained = True
 
+    def _actors(self) -> nn.Module:
+        """A copy of the stacked actors by themselves: observations to actions in the action space's own units."""
+        assert isinstance(self.policy, StackedMlpPolicy)
+        return self.policy.actor()
+
     def _initialize_from_behavior_cloning(self, stage: Pretraining) -> None:
         """theta_0 = (1 - alpha) theta_rand + alpha theta_BC, both from the same initial actor.
 
@@ -135,7 +177,7 @@ class Federation(BaseAlgorithm):
             for index, data in enumerate(stage.datasets()):
                 obs = data.observations.astype(np.float64)
                 self.normalizer.warm_start(index, obs.mean(axis=0), obs.var(axis=0), len(obs))
-        cloned = stage.behavior_cloning(self.policy.actor(), normalize=self.normalize)
+        cloned = stage.behavior_cloning(self._actors(), normalize=self.normalize)
         with th.no_grad():
             for name, tensor in cloned.items():
                 self.policy.actor_parameter(name).lerp_(tensor.to(self.device), self.bc_weight)
@@ -204,8 +246,8 @@ class Federation(BaseAlgorithm):
         normalized = self.normalizer.normalize_obs(split).reshape(observation.shape)
         return self.policy.predict(normalized, state, episode_start, deterministic)
 
-    def client(self, client_id: int) -> PPO:
-        """Client ``client_id``'s policy as an ordinary ``stable_baselines3.PPO`` that takes raw observations.
+    def client(self, client_id: int) -> PPO | DDPG:
+        """Client ``client_id``'s policy as an ordinary ``stable_baselines3`` model that takes raw observations.
 
         :raises ValueError: for a client that does not live here
         """

@@ -24,9 +24,16 @@ class RunningMoments:
         self.var = np.ones((n_clients, *shape))
         self.count = np.full((n_clients, *([1] * len(shape))), epsilon)
 
-    def update(self, batch: np.ndarray) -> None:
-        """:param batch: ``(n_clients, n_samples, *shape)``"""
-        if batch.shape[1] == 1:  # the usual case in a rollout: the batch is its own mean
+    def update(self, batch: np.ndarray, present: np.ndarray | None = None) -> None:
+        """:param batch: ``(n_clients, n_samples, *shape)``
+        :param present: ``(n_clients,)`` bool, whose statistics to update; all if ``None``
+        """
+        if present is not None:
+            before = {name: getattr(self, name)[~present].copy() for name in ("mean", "var", "count")}
+            self.update(batch)
+            for name, rows in before.items():
+                getattr(self, name)[~present] = rows
+        elif batch.shape[1] == 1:  # the usual case in a rollout: the batch is its own mean
             self._merge(batch[:, 0], 0.0, 1)
         else:
             self._merge(batch.mean(axis=1), batch.var(axis=1), batch.shape[1])
@@ -68,10 +75,12 @@ class FederatedNormalizer:
         self.ret = RunningMoments(n_clients, ())
         self.returns = np.zeros((n_clients, n_envs_per_client))
 
-    def update_obs(self, obs: np.ndarray) -> None:
-        """:param obs: raw, ``(n_clients, n_envs_per_client, obs_dim)``"""
+    def update_obs(self, obs: np.ndarray, present: np.ndarray | None = None) -> None:
+        """:param obs: raw, ``(n_clients, n_envs_per_client, obs_dim)``
+        :param present: ``(n_clients,)`` bool, whose statistics to update; all if ``None``
+        """
         if self.norm_obs:
-            self.obs.update(obs)
+            self.obs.update(obs, present)
 
     def normalize_obs(self, obs: np.ndarray, index: int | None = None) -> np.ndarray:
         """Normalised float32 observations.
@@ -87,12 +96,16 @@ class FederatedNormalizer:
         scaled = (obs - mean) / np.sqrt(var + self.EPSILON)
         return np.clip(scaled, -self.CLIP, self.CLIP).astype(np.float32)
 
-    def scale_reward(self, rewards: np.ndarray, dones: np.ndarray) -> np.ndarray:
-        """Account for one step's rewards and scale them; both ``(n_clients, n_envs_per_client)``."""
+    def scale_reward(self, rewards: np.ndarray, dones: np.ndarray, present: np.ndarray | None = None) -> np.ndarray:
+        """Account for one step's rewards and scale them; both ``(n_clients, n_envs_per_client)``.
+
+        :param present: ``(n_clients,)`` bool, who took the step; all if ``None``
+        """
         if not self.norm_reward:
             return rewards
-        self.returns = self.returns * self.gamma + rewards
-        self.ret.update(self.returns)
+        returns = self.returns * self.gamma + rewards
+        self.returns = returns if present is None else np.where(present[:, None], returns, self.returns)
+        self.ret.update(self.returns, present)
         scaled = np.clip(rewards / self.reward_deviation[:, None], -self.CLIP, self.CLIP)
         self.returns[dones] = 0.0
         return scaled

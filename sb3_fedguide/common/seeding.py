@@ -28,3 +28,4 @@ class Role(IntEnum):
     HEAD = 9
     DICE = 10
     SERVER = 11
+    PARTICIPATION = 12

@@ -41,7 +41,7 @@ def record_training(model: FederatedPPO, statistics: RoundStatistics, schedules:
     means["explained_variance"] = np.array([explained_variance(v, r) for v, r in zip(values, returns, strict=True)])
     means["std"] = model.policy.log_std.detach().exp().mean(dim=1).cpu().numpy()
     for name, per_client in means.items():
-        model.logger.record(f"train/{name}", float(np.mean(per_client)))
+        model.logger.record(f"train/{name}", float(np.mean(per_client[model.present])))
     for name in ("approx_kl", "explained_variance", "std", "grad_norm"):
         for client, value in zip(model.client_ids, means[name], strict=True):
             model.record_client(client, name, float(value))

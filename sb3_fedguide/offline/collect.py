@@ -39,6 +39,7 @@ def source_key(family: Family, client: int, policy: BehaviorPolicy | None = None
     return {
         "data_version": DATA_VERSION,
         "mujoco": version("mujoco"),
+        **({"metaworld": version("metaworld")} if family.world == "metaworld" else {}),
         "world": family.world,
         "backbone": family.backbone,
         "max_episode_steps": family.max_episode_steps,
@@ -59,7 +60,8 @@ def collect(
 ) -> tuple[OfflineData, gym.spaces.Box, gym.spaces.Box]:
     """Roll out a client's behaviour in its own MDP.
 
-    The world's scripted policy acts where it has one, the backbone's shipped policy elsewhere. Stored actions are those that the environment was given, strictly inside the bounds.
+    The world's scripted policy acts where it has one, the backbone's shipped policy elsewhere. Stored actions are those that
+    the environment was given, strictly inside the bounds.
 
     :param size: rows
     :param seed: with ``client`` it determines everything that is random

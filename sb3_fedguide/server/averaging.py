@@ -38,6 +38,7 @@ class Averaging(Strategy):
         self.prefixes = prefixes
         self.average_every = average_every
         self.average_until = average_until
+        self._latest: Payload = {}
 
     def is_due(self, round: int) -> bool:
         """Whether the parameters are averaged after round ``round``."""
@@ -55,4 +56,8 @@ class Averaging(Strategy):
             for payload in uploads.values()
         ]
         self.metrics = {"drift": float(np.mean(drifts))}
+        self._latest = average
         return {client: {name: array.copy() for name, array in average.items()} for client in uploads}
+
+    def latest(self, client: int) -> Payload:
+        return {name: array.copy() for name, array in self._latest.items()}

@@ -165,6 +165,12 @@ class OTMoE(Strategy):
         self._measure(cost, rows, error)
         return {client: {EXPERTS: self.experts.copy(), MIXTURE_ROW: self.rows[client]} for client in clients}
 
+    def latest(self, client: int) -> Payload:
+        if self.experts is None:
+            return {}
+        row = {MIXTURE_ROW: self.rows[client]} if client in self.rows else {}
+        return {EXPERTS: self.experts.copy(), **row}
+
     def _costs(self, heads: np.ndarray, uploads: Mapping[int, Payload], clients: list[int]) -> np.ndarray:
         if self.cost == "score":
             return np.stack([uploads[client][COST_ROW] for client in clients]).astype(np.float64)

@@ -38,6 +38,10 @@ class Strategy(ABC):
         :return: broadcast by client id, one for every client in ``uploads``
         """
 
+    def latest(self, client: int) -> Payload:
+        """What a client that missed exchanges receives before it trains again."""
+        return {}
+
 
 class Composite(Strategy):
     """Several strategies side by side; each sees all uploads, and a client receives all their broadcasts."""
@@ -58,3 +62,6 @@ class Composite(Strategy):
                 merged[client].update(payload)
             self.metrics.update(strategy.metrics)
         return merged
+
+    def latest(self, client: int) -> Payload:
+        return {name: array for strategy in self.strategies for name, array in strategy.latest(client).items()}

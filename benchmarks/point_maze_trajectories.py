@@ -1,0 +1,151 @@
+"""Draw where each client's ball rolls in its maze, one row per method, from the folders of finished runs.
+
+    python train.py --algo fedavg --env PointMazeHard
+    python train.py --algo fedguide --env PointMazeHard
+    python benchmarks/point_maze_trajectories.py logs/fedavg/PointMazeHard_1 logs/fedguide/PointMazeHard_1 -o mazes.png
+
+All methods start in the same states (``--seed``) and act without noise, with the policies that the clients deploy: their own
+after local training. Titles have the mean return and the share of episodes that end within 0.45 m of the goal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from fed_envs import Family, FederatedVecEnv
+from fed_envs.mazes import WALL, maze_rows
+from fed_envs.metadata import PointMazeClient, read_family
+from fed_envs.point_maze import SUCCESS_DISTANCE
+from sb3_fedguide.algorithms import ALGORITHMS, algorithm
+from sb3_fedguide.cli.run_folder import read_deployed
+from sb3_fedguide.common.seeding import EVALUATION_SEED, Role
+
+COLORS = ("#2e86ab", "#d1495b", "#3a7d44", "#8e5ea2", "#d98c21", "#777777")
+
+
+class Episodes(NamedTuple):
+    """A method's episodes.
+
+    :param observations: ``(n_clients, n_episodes, steps + 1, 6)``
+    :param returns: ``(n_clients, n_episodes)``
+    """
+
+    method: str
+    observations: np.ndarray
+    returns: np.ndarray
+
+    @property
+    def successes(self) -> np.ndarray:
+        """Whether the ball is at its goal in the end, ``(n_clients, n_episodes)``."""
+        last = self.observations[:, :, -1]
+        return np.linalg.norm(last[..., :2] - last[..., 4:], axis=-1) <= SUCCESS_DISTANCE
+
+
+def read_run(folder: Path) -> tuple[str, Family, Any]:
+    """A run's method, family and saved federation with the deployed policies in place.
+
+    :raises ValueError: if the folder is none of a finished run on a PointMaze family
+    """
+    for name in ("model.zip", "summary.json", "metadata.json"):
+        if not (folder / name).is_file():
+            raise ValueError(f"{folder} is not the folder of a finished run: it has no {name}")
+    family = read_family(folder / "metadata.json")
+    if family.world != "point_maze":
+        raise ValueError(f"{folder} is a run on {family.name}; only PointMaze families have mazes to draw")
+    method = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["algo"]
+    if method not in ALGORITHMS:
+        raise ValueError(f"{folder}: unknown algorithm {method!r}; known are {', '.join(ALGORITHMS)}")
+    model = algorithm(method).load(folder / "model.zip", env=FederatedVecEnv(family), device="cpu")  # type: ignore[attr-defined]
+    deployed = {name: th.as_tensor(array) for name, array in read_deployed(folder).items()}
+    model.policy.load_state_dict({**model.policy.state_dict(), **deployed})
+    return method, family, model
+
+
+def roll_out(method: str, family: Family, model: Any, n_episodes: int, seed: int) -> Episodes:
+    """One seeded episode in each of ``n_episodes`` copies of every client's environment."""
+    env = FederatedVecEnv(family, n_episodes, role=int(Role.EVAL_ENV))
+    env.seed(seed)
+    observations = env.reset()
+    path, returns = [observations], np.zeros(env.num_envs)
+    for _ in range(family.max_episode_steps):
+        actions, _ = model.predict(observations, deterministic=True)
+        observations, rewards, dones, infos = env.step(actions)
+        returns += rewards
+        # The environment restarts at the end: the path ends with the state before that.
+        path.append(np.array([infos[i]["terminal_observation"] if done else observations[i] for i, done in enumerate(dones)]))
+    env.close()
+    shape = (family.n_clients, n_episodes)
+    return Episodes(method, np.stack(path, axis=1).reshape(*shape, len(path), -1), returns.reshape(shape))
+
+
+def _maze(axes: Axes, rows: tuple[str, ...]) -> None:
+    height, width = len(rows), len(rows[0])
+    walls = np.array([[cell == WALL for cell in row] for row in rows], dtype=float)
+    axes.imshow(walls, cmap="Greys", vmin=0, vmax=2, extent=(-width / 2, width / 2, -height / 2, height / 2))
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def draw(family: Family, methods: Sequence[Episodes], path: Path) -> None:
+    """Write the figure.
+
+    :param methods: one row each
+    :param path: a ``.png``, or any other format that matplotlib writes
+    """
+    figure = Figure(figsize=(2.1 * family.n_clients + 0.4, 2.4 * len(methods)), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(methods), family.n_clients, squeeze=False)
+    for number, (line, episodes) in enumerate(zip(grid, methods, strict=True)):
+        for axes, client, paths, returns, successes in zip(
+            line, family.clients, episodes.observations, episodes.returns, episodes.successes, strict=True
+        ):
+            assert isinstance(client, PointMazeClient)
+            _maze(axes, maze_rows(client.maze))
+            for one in paths:
+                axes.plot(one[:, 0], one[:, 1], color=COLORS[number % len(COLORS)], linewidth=0.9, alpha=0.8)
+            axes.plot(*paths[:, -1, :2].T, "s", color=COLORS[number % len(COLORS)], markersize=2.5)
+            axes.plot(*paths[:, 0, :2].T, "o", color="black", markersize=2.5)
+            axes.plot(*paths[:, 0, 4:].T, "*", color="#f2c14e", markeredgecolor="black", markeredgewidth=0.4, markersize=7)
+            axes.set_title(f"client {client.client}: {returns.mean():.0f}, {successes.mean():.0%}", fontsize=8)
+        line[0].set_ylabel(episodes.method, fontsize=10)
+    figure.savefig(path, dpi=130)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of runs on the same family")
+    parser.add_argument("-o", "--output", type=Path, default=Path("point_maze.png"), help="the picture")
+    parser.add_argument("--episodes", type=int, default=5, help="per client (default: 5)")
+    parser.add_argument("--seed", type=int, default=EVALUATION_SEED, help="of the episodes")
+    args = parser.parse_args(arguments)
+    th.set_num_threads(1)
+    try:
+        if args.episodes < 1:
+            raise ValueError(f"--episodes must be at least 1, not {args.episodes}")
+        runs = [read_run(folder) for folder in args.runs]
+        family = runs[0][1]
+        for folder, (_, other, _) in zip(args.runs, runs, strict=True):
+            if other.content_hash != family.content_hash:
+                raise ValueError(f"{folder} is a run on {other.name}, {args.runs[0]} on {family.name}; draw them apart")
+    except ValueError as error:
+        parser.error(str(error))
+    methods = [roll_out(method, own, model, args.episodes, args.seed) for method, own, model in runs]
+    draw(family, methods, args.output)
+    for episodes in methods:
+        shares = " ".join(f"{share:.0%}" for share in episodes.successes.mean(axis=1))
+        print(f"{episodes.method}: average {episodes.returns.mean():.1f}, at the goal in the end by client: {shares}")
+    print(args.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""FedKL: federated averaging with penalties on leaving the broadcast policy and the policy of the rollout."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch as th
+
+from sb3_fedguide.algorithms.fedprox import AnchoredFedAvg
+from sb3_fedguide.common import gaussian
+from sb3_fedguide.common.anchors import actor_at
+from sb3_fedguide.common.buffers import FederatedSamples
+from sb3_fedguide.common.federation import FederationLike, PolicyLike
+
+
+class FedKL(AnchoredFedAvg):
+    """FedAvg whose clients minimise ``L_PPO + lambda_global * KL(pi || pi_bar) + lambda_local * KL(pi || pi_old)``.
+
+    ``pi_bar`` is the last broadcast policy and ``pi_old`` the policy at the start of the round, both at the client's own
+    states; the divergences are exact, averaged over states. With an average after every round the two policies are the
+    same, and the weights add up; they differ where ``average_every > 1`` or after ``average_until``. Both weights zero
+    is FedAvg.
+
+    Weights and directions are those of the FedGuide paper's baseline. The original penalises ``sqrt(KL(pi_bar || pi))``
+    and ``KL(pi_old || pi)``, minimises by SGD and adapts the weights.
+
+    Paper: https://arxiv.org/abs/2204.08125
+
+    :param lambda_global: weight of the divergence from the broadcast policy
+    :param lambda_local: weight of the divergence from the policy of the rollout
+    :raises ValueError: for negative weights, and where no policy is averaged
+
+    All other parameters are those of :class:`FedAvg`.
+    """
+
+    def __init__(
+        self,
+        policy: PolicyLike,
+        env: FederationLike | None,
+        lambda_global: float = 0.1,
+        lambda_local: float = 0.05,
+        **fedavg: object,
+    ) -> None:
+        for name, weight in (("lambda_global", lambda_global), ("lambda_local", lambda_local)):
+            if not 0 <= weight < np.inf:
+                raise ValueError(f"{name}={weight} must not be negative: it weighs a divergence; 0 leaves it out")
+        if fedavg.get("average") == "critic":
+            raise ValueError(
+                "FedKL stays near the broadcast policy, and average='critic' broadcasts none; use 'all' or 'actor'"
+            )
+        self.lambda_global = lambda_global
+        self.lambda_local = lambda_local
+        self._log_stds: dict[str, th.Tensor] = {}
+        super().__init__(policy, env, **fedavg)
+
+    @th.no_grad()
+    def _prepare_training(self) -> None:
+        super()._prepare_training()
+        buffer = self.rollout_buffer
+        observations = th.as_tensor(buffer.rows(buffer.observations), device=self.device)
+        if self.lambda_global > 0:
+            actor, tensors = actor_at(self.policy, self.anchor)
+            buffer.extras["broadcast_mean"] = actor(observations)
+            self._log_stds["broadcast"] = tensors["log_std"].detach()
+        if self.lambda_local > 0:
+            buffer.extras["old_mean"] = self.policy.actor_mean(observations)
+            self._log_stds["old"] = self.policy.log_std.detach().clone()
+
+    def _extra_losses(self, data: FederatedSamples, mean: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
+        losses = {}
+        for name, key, weight in (
+            ("global_kl_loss", "broadcast", self.lambda_global),
+            ("local_kl_loss", "old", self.lambda_local),
+        ):
+            if weight > 0:
+                kl = gaussian.kl_divergence(mean, self.policy.log_std, data.extras[f"{key}_mean"], self._log_stds[key])
+                losses[name] = weight * kl.mean(dim=1)
+        return losses
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_log_stds"]

@@ -1,0 +1,75 @@
+"""FedProx: federated averaging with a proximal term around the last broadcast."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch as th
+
+from sb3_fedguide.algorithms.fedavg import AVERAGED_PREFIXES, FedAvg
+from sb3_fedguide.common.anchors import Parameters, snapshot
+from sb3_fedguide.common.buffers import FederatedSamples
+from sb3_fedguide.common.federation import FederationLike, PolicyLike
+from sb3_fedguide.server.strategy import Payload
+
+
+class AnchoredFedAvg(FedAvg):
+    """FedAvg whose clients remember the last broadcast; the base class of methods that stay near it.
+
+    Before the first broadcast a client's anchor is what it starts its first round with. Parameters are those of
+    :class:`FedAvg`.
+    """
+
+    def __init__(self, policy: PolicyLike, env: FederationLike | None, **fedavg: object) -> None:
+        self.anchor: Parameters = {}  # theta_bar as each client last received it
+        super().__init__(policy, env, **fedavg)  # type: ignore[arg-type]
+
+    def receive(self, index: int, broadcast: Payload) -> None:
+        self._initialize_anchor()
+        super().receive(index, broadcast)
+        for name, array in broadcast.items():
+            self.anchor[name][index] = array
+
+    def _prepare_training(self) -> None:
+        self._initialize_anchor()
+
+    def _initialize_anchor(self) -> None:
+        if not self.anchor:
+            self.anchor = snapshot(self.policy, AVERAGED_PREFIXES[self.average])
+
+
+class FedProx(AnchoredFedAvg):
+    """FedAvg whose clients minimise ``L_PPO + mu / 2 * ||theta - theta_bar||^2``.
+
+    ``theta_bar`` is the last broadcast. The term covers what is averaged: actor (with ``log_std``) and critic by default.
+    ``mu = 0`` is FedAvg.
+
+    Paper: https://arxiv.org/abs/1812.06127 (Eq. 2)
+
+    :param mu: weight of the proximal term
+    :raises ValueError: for a negative ``mu``
+
+    All other parameters are those of :class:`FedAvg`.
+    """
+
+    def __init__(self, policy: PolicyLike, env: FederationLike | None, mu: float = 0.01, **fedavg: object) -> None:
+        if not 0 <= mu < np.inf:
+            raise ValueError(f"mu={mu} must not be negative: it is the weight of the proximal term; 0 is FedAvg")
+        self.mu = mu
+        self._anchor_tensors: dict[str, th.Tensor] = {}
+        super().__init__(policy, env, **fedavg)
+
+    def _prepare_training(self) -> None:
+        super()._prepare_training()
+        self._anchor_tensors = {name: th.as_tensor(array, device=self.device) for name, array in self.anchor.items()}
+
+    def _extra_losses(self, data: FederatedSamples, mean: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
+        if self.mu == 0:
+            return {}
+        distance = th.zeros(self.n_clients, device=self.device)
+        for name, anchor in self._anchor_tensors.items():
+            difference = self.policy.get_parameter(name) - anchor
+            distance = distance + (difference**2).flatten(1).sum(dim=1)
+        return {"proximal_loss": 0.5 * self.mu * distance}
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_anchor_tensors"]

@@ -1,0 +1,160 @@
+"""FedSVRPG-M: variance-reduced policy gradients whose momentum is a direction that all clients share."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch as th
+
+from sb3_fedguide.algorithms.fedavg import AVERAGED_PREFIXES, FedAvg
+from sb3_fedguide.common import gaussian
+from sb3_fedguide.common.anchors import Parameters, actor_at, snapshot
+from sb3_fedguide.common.buffers import FederatedSamples
+from sb3_fedguide.common.federation import FederationLike, PolicyLike
+from sb3_fedguide.common.policies import ACTOR_PREFIXES, StackedActor
+from sb3_fedguide.server.strategy import Payload, Strategy
+from sb3_fedguide.server.svrpg import DIRECTION, SVRPG
+
+
+class FedSVRPGM(FedAvg):
+    """FedAvg whose actors follow ``u = beta * g + (1 - beta) * (u_r + g - g_ref)`` instead of their gradient ``g``.
+
+    ``g`` is the ascent gradient of PPO's surrogate at the current policy and ``g_ref`` that of the same surrogate of the
+    same minibatch at the reference policy, with the ratio ``pi_ref / pi_old`` inside the clip; their difference has less
+    noise than ``g``. ``u_r`` is the average of all clients' directions in the round before, zero at first: each uploads
+    the mean of its ``u`` over the round's minibatches, before the norm is clipped. The critic keeps its own gradient,
+    and ``max_grad_norm`` bounds both together. ``beta = 1`` is FedAvg; a reference equal to the current policy leaves
+    ``beta * g + (1 - beta) * u_r``.
+
+    This is the practical form for PPO: the original takes one SGD step per trajectory, weighs ``g_ref`` by the importance
+    of the whole trajectory, and its reference is the broadcast before the last.
+
+    Paper: https://arxiv.org/abs/2405.19499
+
+    :param beta: weight of the plain gradient, in [0, 1]
+    :param reference_every: the reference policy becomes the client's policy at the start of every so many rounds, which
+        is the broadcast; in the first round, the policy that it starts with
+    :raises ValueError: for values out of range, and where no policy is averaged
+
+    All other parameters are those of :class:`FedAvg`.
+    """
+
+    def __init__(
+        self,
+        policy: PolicyLike,
+        env: FederationLike | None,
+        beta: float = 0.2,
+        reference_every: int = 5,
+        **fedavg: object,
+    ) -> None:
+        if not 0.0 <= beta <= 1.0:
+            raise ValueError(f"beta={beta} must lie in [0, 1]: it is the weight of the plain gradient; 1 is FedAvg")
+        if reference_every < 1:
+            raise ValueError(f"reference_every={reference_every} must be at least 1 round")
+        if fedavg.get("average") == "critic":
+            raise ValueError("FedSVRPG-M shares the actors' directions, and average='critic' no actor; use 'all' or 'actor'")
+        self.beta = beta
+        self.reference_every = reference_every
+        self.reference: Parameters = {}  # theta_ref of each client
+        self.reference_period = np.zeros(0, dtype=int)  # when each took it, counted in periods of `reference_every` rounds
+        self.momentum: Parameters = {}  # u_r as each client last received it
+        self.directions: Parameters = {}  # each client's mean u of the last round
+        self._reference_actor: StackedActor | None = None
+        self._reference_tensors: dict[str, th.Tensor] = {}
+        self._momentum_tensors: dict[str, th.Tensor] = {}
+        self._direction_sums: dict[str, th.Tensor] = {}
+        self._n_directions = 0
+        super().__init__(policy, env, **fedavg)  # type: ignore[arg-type]
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if not self.momentum:  # otherwise they come from a saved model
+            self.momentum = {name: np.zeros_like(array) for name, array in snapshot(self.policy, ACTOR_PREFIXES).items()}
+            self.directions = {name: array.copy() for name, array in self.momentum.items()}
+
+    def _make_strategy(self) -> Strategy:
+        return SVRPG(AVERAGED_PREFIXES[self.average], self.average_every, self.average_until)
+
+    def upload(self, index: int) -> Payload:
+        """Parameters and number of samples as in FedAvg, and ``direction.<actor parameter>``."""
+        payload = super().upload(index)
+        payload.update({DIRECTION + name: array[index].copy() for name, array in self.directions.items()})
+        return payload
+
+    def receive(self, index: int, broadcast: Payload) -> None:
+        super().receive(index, {name: array for name, array in broadcast.items() if not name.startswith(DIRECTION)})
+        for name, array in broadcast.items():
+            if name.startswith(DIRECTION):
+                self.momentum[name.removeprefix(DIRECTION)][index] = array
+
+    def _prepare_training(self) -> None:
+        self._refresh_references()
+        self._reference_actor, self._reference_tensors = actor_at(self.policy, self.reference)
+        self._momentum_tensors = {name: th.as_tensor(array, device=self.device) for name, array in self.momentum.items()}
+        self._direction_sums = {name: th.zeros_like(tensor) for name, tensor in self._momentum_tensors.items()}
+        self._n_directions = 0
+        self._record_ratios()
+
+    def _refresh_references(self) -> None:
+        """Clients that were away when the others took a new reference take theirs when they are back."""
+        current = snapshot(self.policy, ACTOR_PREFIXES)
+        if not self.reference:
+            self.reference, self.reference_period = current, np.full(self.n_clients, -1)
+        period = self.round // self.reference_every
+        due = (self.reference_period != period) | (self.round % self.reference_every == 0)
+        for index in np.flatnonzero(due & self.present):
+            for name, array in current.items():
+                self.reference[name][index] = array[index]
+            self.reference_period[index] = period
+
+    @th.no_grad()
+    def _record_ratios(self) -> None:
+        """How far the reference has fallen behind: ``pi_ref / pi_old`` has mean one, but may come from few samples."""
+        buffer = self.rollout_buffer
+        rows = [th.as_tensor(buffer.rows(array), device=self.device) for array in (buffer.observations, buffer.actions)]
+        ratio = th.exp(self._reference_log_prob(*rows) - th.as_tensor(buffer.rows(buffer.log_probs), device=self.device))
+        effective = ratio.sum(dim=1) ** 2 / (ratio**2).sum(dim=1) / buffer.n_rows
+        present = th.as_tensor(self.present, device=self.device)
+        self.logger.record("svrpg/effective_sample_share", float(effective[present].mean()))
+        self.logger.record("svrpg/reference_ratio_max", float(ratio[present].max()))
+
+    def _reference_log_prob(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        assert self._reference_actor is not None
+        return gaussian.log_prob(self._reference_actor(observations), self._reference_tensors["log_std"], actions)
+
+    def _reference_gradients(self, data: FederatedSamples) -> dict[str, th.Tensor]:
+        """g_ref by parameter: the ascent gradient of what :meth:`train` maximises, at theta_ref."""
+        advantages = data.advantages
+        if self.normalize_advantage and advantages.shape[1] > 1:
+            centred = advantages - advantages.mean(dim=1, keepdim=True)
+            advantages = centred / (advantages.std(dim=1, keepdim=True) + 1e-8)
+        # Actions come from pi_old, so E[ratio] = 1 however old the reference is: no cap beyond the surrogate's own.
+        ratio = th.exp(self._reference_log_prob(data.observations, data.actions) - data.old_log_prob)
+        clip_range = self.clip_range(self._current_progress_remaining)
+        clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
+        objective = th.min(advantages * ratio, advantages * clipped).mean(dim=1)
+        objective = objective + self.ent_coef * gaussian.entropy(self._reference_tensors["log_std"])
+        gradients = th.autograd.grad(objective.sum(), list(self._reference_tensors.values()))
+        return dict(zip(self._reference_tensors, gradients, strict=True))
+
+    def _transform_gradients(self, data: FederatedSamples) -> None:
+        for name, reference_gradient in self._reference_gradients(data).items():
+            descent = self.policy.get_parameter(name).grad
+            assert descent is not None
+            direction = variance_reduced(-descent, reference_gradient, self._momentum_tensors[name], self.beta)
+            self._direction_sums[name] += direction
+            descent.copy_(-direction)
+        self._n_directions += 1
+
+    def _finish_training(self) -> None:
+        for name, total in self._direction_sums.items():
+            means = (total / self._n_directions).cpu().numpy()
+            self.directions[name][self.present] = means[self.present]
+
+    def _excluded_save_params(self) -> list[str]:
+        of_one_round = ["_reference_actor", "_reference_tensors", "_momentum_tensors", "_direction_sums"]
+        return [*super()._excluded_save_params(), *of_one_round]
+
+
+def variance_reduced(gradient: th.Tensor, reference_gradient: th.Tensor, momentum: th.Tensor, beta: float) -> th.Tensor:
+    """``u = beta * g + (1 - beta) * (u_r + g - g_ref)``; all of one shape, in the ascent convention."""
+    return beta * gradient + (1 - beta) * (momentum + (gradient - reference_gradient))

@@ -1,0 +1,36 @@
+"""Earlier policies that a method holds on to: kept as arrays, brought back as tensors or as actors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch as th
+
+from sb3_fedguide.common.policies import StackedActor, StackedMlpPolicy
+
+#: Parameters of all clients by SB3's name, ``(n_clients, ...)`` each; arrays, so that a saved model loads on any device.
+Parameters = dict[str, np.ndarray]
+
+
+def snapshot(policy: StackedMlpPolicy, prefixes: tuple[str, ...]) -> Parameters:
+    """Copies of the parameters whose names begin with one of ``prefixes``."""
+    named = policy.named_parameters()
+    return {name: parameter.detach().cpu().numpy().copy() for name, parameter in named if name.startswith(prefixes)}
+
+
+def actor_at(policy: StackedMlpPolicy, parameters: Mapping[str, np.ndarray]) -> tuple[StackedActor, dict[str, th.Tensor]]:
+    """An actor of this policy's architecture with other parameters, on this policy's device.
+
+    :param parameters: at least every actor parameter, as :func:`snapshot` names them
+    :return: the actor, and its trainable tensors under the policy's names, ``log_std`` among them
+    """
+    actor = policy.actor()
+    log_std = th.as_tensor(parameters["log_std"]).to(policy.log_std, copy=True).requires_grad_()
+    tensors: dict[str, th.Tensor] = {"log_std": log_std}
+    with th.no_grad():
+        for name, tensor in actor.named_parameters():
+            full_name = name if name.startswith("action_net.") else f"mlp_extractor.{name}"
+            tensor.copy_(th.as_tensor(parameters[full_name]))
+            tensors[full_name] = tensor
+    return actor, tensors

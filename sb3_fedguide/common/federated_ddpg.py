@@ -1,0 +1,366 @@
+"""Deep deterministic policy gradient of N clients in lockstep: one SB3 algorithm is a whole federation."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3 import DDPG
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.td3.policies import TD3Policy
+from torch import nn
+
+from fed_envs import FederatedVecEnv
+from sb3_fedguide.common.callbacks import round_callbacks
+from sb3_fedguide.common.ddpg_policy import BoundedActor, StackedDDPGPolicy
+from sb3_fedguide.common.ddpg_settings import check_settings
+from sb3_fedguide.common.export import client_ddpg, export_program
+from sb3_fedguide.common.federation import Federation, FederationLike, as_federated_env
+from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
+from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.participation import ParticipationAdam
+from sb3_fedguide.common.replay import FederatedReplayBuffer
+from sb3_fedguide.common.seeding import Role, integer_seed
+from sb3_fedguide.common.training_log import RoundStatistics
+from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
+
+SelfFederatedDDPG = TypeVar("SelfFederatedDDPG", bound="FederatedDDPG")
+
+
+class FederatedDDPG(Federation, DDPG):
+    """DDPG for every client of a family at once; the base class of off-policy methods.
+
+    ``rollout_size`` environment steps per client, with gradient steps in between, are one communication round. Each client
+    has its own replay buffer, exploration noise and random streams, and one stacked gradient step serves them all. Without
+    a server ``strategy``, N clients learn exactly as N federations of one, and a gradient step is SB3's.
+
+    The replay buffer is not part of a saved model, as in SB3: a loaded one first fills ``learning_starts`` transitions again,
+    with its own policy, unless ``load_replay_buffer`` brings them back.
+
+    Paper: https://arxiv.org/abs/1509.02971 (DDPG)
+
+    :param policy: ``"MlpPolicy"``
+    :param env: what a federation can be made of, as for :class:`FederatedPPO`
+    :param learning_rate: of actor and critic
+    :param rollout_size: environment steps per client and round
+    :param buffer_size: capacity of each client's replay buffer
+    :param learning_starts: transitions of each client before its first gradient step; its first steps are random
+    :param batch_size: minibatch size per client
+    :param tau: fraction by which target networks follow at each gradient step
+    :param gamma: discount factor
+    :param train_freq: steps of every environment between trainings; must divide ``rollout_size / n_envs_per_client``
+    :param gradient_steps: gradient steps each time; -1 for as many as there were new transitions per client
+    :param noise_theta: pull towards zero of the Ornstein-Uhlenbeck exploration noise, in units of actions in [-1, 1]
+    :param noise_sigma: its scale
+    :param noise_dt: its time step; 1 in the paper, 0.01 in SB3
+    :param n_envs_per_client: environments per client; must divide ``rollout_size``
+    :param clients: ids of the clients that live here; all by default
+    :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client
+    :param bc_weight: alpha of ``theta_0 = (1 - alpha) theta_rand + alpha theta_BC`` for the actor (paper: 0.3)
+    :param client_fraction: share of the clients that take part in each round, as for :class:`FederatedPPO`
+    :param pretraining: settings of the offline stage, a ``PretrainingConfig`` or a dict of its fields
+    :param cache_dir: where the offline stage keeps its results; by default the user's cache folder
+    :param stats_window_size: finished episodes per client over which returns are averaged
+    :param tensorboard_log: as in SB3, like ``policy_kwargs``, ``verbose`` and ``device``
+    :param seed: the federation's seed; drawn and stored if ``None``
+    :raises ValueError: for settings that do not fit, with the remedy in the message
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": StackedDDPGPolicy}
+    replay_buffer: FederatedReplayBuffer | None  # type: ignore[assignment]
+    policy: StackedDDPGPolicy
+    train_freq: int
+
+    def __init__(
+        self,
+        policy: str | type[TD3Policy],
+        env: FederationLike | None,
+        learning_rate: float | Schedule = 1e-4,
+        rollout_size: int = 4096,
+        buffer_size: int = 100_000,
+        learning_starts: int = 1000,
+        batch_size: int = 64,
+        tau: float = 1e-3,
+        gamma: float = 0.99,
+        train_freq: int = 1,
+        gradient_steps: int = 1,
+        noise_theta: float = 0.15,
+        noise_sigma: float = 0.2,
+        noise_dt: float = 1.0,
+        n_envs_per_client: int = 1,
+        clients: Sequence[int] | None = None,
+        normalize: bool = False,
+        bc_weight: float = 0.0,
+        client_fraction: float = 1.0,
+        pretraining: PretrainingConfig | dict[str, Any] | None = None,
+        cache_dir: str | Path | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "cpu",
+        _init_setup_model: bool = True,
+    ) -> None:
+        env = as_federated_env(env, n_envs_per_client, clients)
+        self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction)
+        self.rollout_size = rollout_size
+        self.noise_theta, self.noise_sigma, self.noise_dt = noise_theta, noise_sigma, noise_dt
+        #: steps that each client has taken in its life, ``(n_clients,)``
+        self.client_steps = np.zeros(self.n_clients, dtype=int)
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self._stats_window_size = stats_window_size
+        check_settings(self)
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        assert self.seed is not None
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        if self.replay_buffer is None:
+            self.replay_buffer = FederatedReplayBuffer(
+                self.buffer_size,
+                self.observation_space,  # type: ignore[arg-type]
+                self.action_space,  # type: ignore[arg-type]
+                self.n_clients,
+                self.n_envs_per_client,
+                self.device,
+            )
+        kwargs = {**self.policy_kwargs, "n_clients": self.n_clients, "init_seed": integer_seed(self.seed, Role.INIT)}
+        if self.n_participants < self.n_clients:
+            kwargs["optimizer_class"] = ParticipationAdam
+        self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs).to(self.device)  # type: ignore
+        self._create_aliases()
+        shape = (self.n_clients, self.n_envs_per_client, self.action_space.shape[0])  # type: ignore[index]
+        self.noise = OrnsteinUhlenbeckNoise(shape, self.noise_theta, self.noise_sigma, self.noise_dt)
+        self.normalizer = FederatedNormalizer(
+            self.n_clients,
+            self.n_envs_per_client,
+            self.observation_space.shape[0],  # type: ignore[index]
+            self.gamma,
+            norm_obs=self.normalize,
+            norm_reward=self.normalize,
+        )
+        if self.strategy is None:
+            self.strategy = self._make_strategy()
+
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        return [self.actor.optimizer, self.critic.optimizer]
+
+    def _actors(self) -> nn.Module:
+        return self.policy.bounded_actors()
+
+    def _initialize_from_behavior_cloning(self, stage: Pretraining) -> None:
+        super()._initialize_from_behavior_cloning(stage)
+        self.policy.copy_to_targets()
+
+    def learn(
+        self: SelfFederatedDDPG,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfFederatedDDPG:
+        """Train for ``total_timesteps`` steps of all clients together, rounded up to whole rounds; otherwise as in SB3."""
+        self.pretrain(progress_bar)
+        reset = reset_num_timesteps or self._last_obs is None
+        # SB3's loop knows no rounds: its rollouts are single steps, and it logs by episodes.
+        total_timesteps, callbacks = self._setup_learn(
+            total_timesteps,
+            self._round_callbacks(callback, total_timesteps, progress_bar),
+            reset_num_timesteps,
+            tb_log_name or type(self).__name__,
+        )
+        if reset_num_timesteps:
+            self.round = 0
+        if reset:
+            self.noise.reset()
+        self._begin_learning(environments_were_reset=reset)
+        rounds = list(round_callbacks(callbacks))
+        callbacks.on_training_start(locals(), globals())
+        while self.num_timesteps < total_timesteps:
+            started = time.perf_counter()
+            self._statistics, self._training_seconds = RoundStatistics(), 0.0
+            self._draw_participants()
+            for hook in rounds:
+                hook.on_round_start()
+            if not self.collect_rollouts(self.env, callbacks, self.rollout_size // self.n_envs_per_client):  # type: ignore
+                break
+            self.logger.record("time/rollout", time.perf_counter() - started - self._training_seconds)
+            self.logger.record("time/train", self._training_seconds)
+            self._record_training()
+            for hook in rounds:
+                hook.on_local_training_end()
+            self.round += 1
+            for hook in rounds:
+                hook.on_round_end()
+            if log_interval is not None and self.round % log_interval == 0:
+                self.dump_logs(self.round)
+        callbacks.on_training_end()
+        return self
+
+    def collect_rollouts(  # type: ignore[override]
+        self, env: FederatedVecEnv, callback: BaseCallback, n_rollout_steps: int
+    ) -> bool:
+        """One round: steps of all environments, with gradient steps in between."""
+        assert self._last_obs is not None and self.replay_buffer is not None
+        shape = (self.n_clients, self.n_envs_per_client)
+        gradient_steps = self.gradient_steps if self.gradient_steps > 0 else self.train_freq * self.n_envs_per_client
+        present = None if self.present.all() else self.present
+        callback.on_rollout_start()
+        noise = self._noise_draws(n_rollout_steps)
+        raw_obs = self._last_obs.reshape(*shape, -1)  # type: ignore[union-attr]
+        for step in range(n_rollout_steps):
+            scaled_actions = self._explore(raw_obs, noise[step])
+            actions = self.policy.unscale_action(scaled_actions).reshape(env.num_envs, -1)
+            new_raw_obs, raw_rewards, flat_dones, infos = env.step(actions)
+            self.num_timesteps += int(env.active.sum())
+            self.client_steps[self.present] += self.n_envs_per_client
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            next_raw, dones, rewards = new_raw_obs.reshape(*shape, -1), flat_dones.reshape(shape), raw_rewards.reshape(shape)  # type: ignore[union-attr]
+            self.normalizer.update_obs(next_raw, present)
+            self.normalizer.scale_reward(rewards, dones, present)  # for its statistics: the buffer keeps raw rewards
+            final_obs, terminations = self._ends(next_raw, dones, infos)
+            self.replay_buffer.add(raw_obs, final_obs, scaled_actions, rewards, terminations, present)
+            self.noise.reset(dones)
+            raw_obs, self._last_obs = next_raw, new_raw_obs  # type: ignore[assignment]
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            if (step + 1) % self.train_freq == 0 and self._ready().any():
+                started = time.perf_counter()
+                self.train(gradient_steps, self.batch_size)
+                self._training_seconds += time.perf_counter() - started
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _noise_draws(self, n_steps: int) -> np.ndarray:
+        """Standard normal draws for a whole round, from each client's own stream: ``(n_steps, n_clients, n_envs, dim)``."""
+        draws = np.zeros((n_steps, *self.noise.state.shape))
+        for index, rng in self.present_streams(Role.ACTION):
+            draws[:, index] = rng.standard_normal((n_steps, *draws.shape[2:]))
+        return draws
+
+    @th.no_grad()
+    def _explore(self, raw_obs: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Actions in [-1, 1], ``(n_clients, n_envs, dim)``: uniform during the warm-up, then the actors'; plus noise."""
+        obs = th.as_tensor(self.normalizer.normalize_obs(raw_obs), device=self.device)
+        actions = self.policy.actions(obs).cpu().numpy()
+        warming_up = self.client_steps < self.learning_starts
+        if warming_up.any():
+            for index, rng in self.present_streams(Role.ACTION):
+                if warming_up[index]:
+                    actions[index] = rng.uniform(-1.0, 1.0, normal.shape[1:])
+        noise = self.noise(normal, None if self.present.all() else self.present)
+        return np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
+
+    def _ready(self) -> np.ndarray:
+        """Who takes part and has the transitions to learn from, ``(n_clients,)`` bool."""
+        assert self.replay_buffer is not None
+        return self.present & (self.replay_buffer.sizes > self.learning_starts)
+
+    def _ends(self, next_obs: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
+        """What the transitions led to, before any reset, and whether it was terminal; keeps finished episodes' infos."""
+        terminations = dones.copy()
+        if dones.any():
+            next_obs = next_obs.copy()
+            for client, env in np.argwhere(dones):
+                info = infos[client * self.n_envs_per_client + env]
+                next_obs[client, env] = info["terminal_observation"]
+                terminations[client, env] = not info.get("TimeLimit.truncated", False)
+                if "episode" in info:
+                    self.episode_infos[client].append(info["episode"])
+        return next_obs, terminations
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """SB3's DDPG update for all clients at once; their losses are summed, so that no gradient mixes two clients."""
+        assert self.replay_buffer is not None
+        actor_parameters = self.policy.actor_parameters
+        self._update_learning_rate(self._optimizers())
+        ready = self._ready()
+        learners: th.Tensor | None = None
+        if self.n_participants < self.n_clients:
+            learners = th.as_tensor(np.flatnonzero(ready), device=self.device)
+            for optimizer in self._optimizers():
+                optimizer.present = ready  # type: ignore[attr-defined]
+        counted = th.as_tensor(ready, device=self.device).float()
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            streams = [(index, rng) for index, rng in self.present_streams(Role.MINIBATCH) if ready[index]]
+            data = self.replay_buffer.sample(batch_size, streams, self.normalizer)
+            with th.no_grad():
+                next_values = self.policy.target_values(
+                    data.next_observations, self.policy.target_actions(data.next_observations)
+                )
+                targets = data.rewards + (1 - data.terminations) * self.gamma * next_values
+            critic_loss = ((self.policy.values(data.observations, data.actions) - targets) ** 2).mean(dim=1)
+            self.critic.optimizer.zero_grad()
+            critic_loss.sum().backward()
+            self.critic.optimizer.step()
+
+            actor_loss = -self.policy.values(data.observations, self.policy.actions(data.observations)).mean(dim=1)
+            # Only the actors' gradients: those of the critics' weights would be computed for nothing.
+            gradients = th.autograd.grad(actor_loss.sum(), actor_parameters)
+            for parameter, gradient in zip(actor_parameters, gradients, strict=True):
+                parameter.grad = gradient
+            self.actor.optimizer.step()
+            self.policy.update_targets(self.tau, learners)
+            self._statistics.add(critic_loss=critic_loss * counted, actor_loss=actor_loss * counted, updates=counted)
+
+    def _record_training(self) -> None:
+        means = self._statistics.means()
+        share = means.pop("updates", np.zeros(self.n_clients))
+        learned = np.flatnonzero(share)
+        for name, per_client in means.items():
+            per_client = per_client[learned] / share[learned]
+            self.logger.record(f"train/{name}", float(np.mean(per_client)))
+            for index, value in zip(learned, per_client, strict=True):
+                self.record_client(self.client_ids[index], name, float(value))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def client(self, client_id: int) -> DDPG:
+        """Client ``client_id``'s policy as an ordinary ``stable_baselines3.DDPG`` that takes raw observations.
+
+        Networks, targets and normalisation are copied; Adam's moments and the replay buffer are not.
+
+        :raises ValueError: for a client that does not live here
+        """
+        return client_ddpg(self, self._position(client_id))
+
+    def export(self, client_id: int, path: str | Path) -> None:
+        actor: Any = self.client(client_id).policy.actor
+        policy = nn.Sequential(actor.features_extractor, BoundedActor(actor.mu, self.action_space))  # type: ignore[arg-type]
+        export_program(policy, self.observation_space.shape[0], path)  # type: ignore[index]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_statistics"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "actor.optimizer", "critic.optimizer", "normalizer"], []
