@@ -20,9 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_fedguide.algorithms import ALGORITHMS
+
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
-METHODS = ("local", "fedavg", "fedguide", "fedguide-p", "fedguide-a")
+METHODS = tuple(ALGORITHMS)
 #: F of the paper, mean over its five seeds (its Table of results); Bandit2D has no figures there.
 PAPER = {"HopperHard": {"fedavg": 216, "fedguide-a": 398, "fedguide-p": 437, "fedguide": 510}}
 
