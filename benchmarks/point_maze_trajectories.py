@@ -23,8 +23,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from fed_envs import Family, FederatedVecEnv
+from fed_envs.clients import PointMazeClient
 from fed_envs.mazes import WALL, maze_rows
-from fed_envs.metadata import PointMazeClient, read_family
+from fed_envs.metadata import read_family
 from fed_envs.point_maze import SUCCESS_DISTANCE
 from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.run_folder import read_deployed

@@ -16,22 +16,33 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from fed_envs.registration import FAMILIES, register_families
+from fed_envs.registration import FAMILIES, register_families, register_family, register_world
 
 if TYPE_CHECKING:
-    from fed_envs.metadata import Client, Family, load_family
+    from fed_envs.clients import Client
+    from fed_envs.metadata import Family, load_family
     from fed_envs.vec_env import FederatedVecEnv
 
-__all__ = ["FAMILIES", "Client", "Family", "FederatedVecEnv", "load_family"]
+__all__ = ["FAMILIES", "Client", "Family", "FederatedVecEnv", "load_family", "register_family", "register_world"]
 
 _LAZY = {
-    "Client": "fed_envs.metadata",
+    "Client": "fed_envs.clients",
     "Family": "fed_envs.metadata",
     "load_family": "fed_envs.metadata",
     "FederatedVecEnv": "fed_envs.vec_env",
 }
 
-_SUBMODULES = ("bandit2d", "generation", "locomotion", "metadata", "metaworld10", "point_maze", "reacher", "vec_env")
+_SUBMODULES = (
+    "bandit2d",
+    "clients",
+    "generation",
+    "locomotion",
+    "metadata",
+    "metaworld10",
+    "point_maze",
+    "reacher",
+    "vec_env",
+)
 
 
 def __getattr__(name: str) -> Any:

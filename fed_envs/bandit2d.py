@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from fed_envs.metadata import BANDIT2D_PEAKS, Bandit2DClient, Family
+from fed_envs.clients import BANDIT2D_PEAKS, Bandit2DClient
+from fed_envs.metadata import Family
 from fed_envs.world import Batch, ClientEnv, Runner, ScriptedPolicy, run_here
 
 PEAKS = np.array(BANDIT2D_PEAKS)  # (4, 2)

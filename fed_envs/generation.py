@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from fed_envs.clients import BANDIT2D_PEAKS
 from fed_envs.mazes import MAZES, distances, free_cells
-from fed_envs.metadata import BANDIT2D_PEAKS, SCHEMA_VERSION, Family, load_family, parse_family
+from fed_envs.metadata import SCHEMA_VERSION, Family, load_family, parse_family
 from fed_envs.registration import FAMILIES
 
 #: Seeds that give back the paper's families (eight clients).

@@ -10,7 +10,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from fed_envs.metadata import Family, LocomotionClient
+from fed_envs.clients import LocomotionClient
+from fed_envs.metadata import Family
 from fed_envs.mujoco_world import MujocoBatch, MujocoClientEnv
 
 
@@ -151,7 +152,7 @@ class LocomotionEnv(MujocoClientEnv[LocomotionClient]):
 
     ## Arguments
     Those of :class:`fed_envs.world.ClientEnv` and ``width``, ``height``; any field of
-    :class:`fed_envs.metadata.LocomotionClient` as a keyword replaces the client's own, e.g. ``floor_priority=True``: MuJoCo
+    :class:`fed_envs.clients.LocomotionClient` as a keyword replaces the client's own, e.g. ``floor_priority=True``: MuJoCo
     takes the larger friction of two touching geoms, so that a slippery floor under a foot of friction 2.0 changes nothing
     unless the floor has priority.
 

@@ -16,7 +16,8 @@ from gymnasium import spaces
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.policies import ENV_POLICY_MAP
 
-from fed_envs.metadata import Family, MetaWorldClient
+from fed_envs.clients import MetaWorldClient
+from fed_envs.metadata import Family
 from fed_envs.mujoco_world import MujocoClientEnv
 from fed_envs.seeding import stream
 from fed_envs.world import Batch, Runner, ScriptedPolicy, run_here
@@ -139,7 +140,7 @@ class MetaWorldEnv(MujocoClientEnv[MetaWorldClient]):
 
     ## Arguments
     Those of :class:`fed_envs.world.ClientEnv` and ``width``, ``height``; any field of
-    :class:`fed_envs.metadata.MetaWorldClient` as a keyword replaces the client's own, e.g. ``fixed_goal=True``. ``model``
+    :class:`fed_envs.clients.MetaWorldClient` as a keyword replaces the client's own, e.g. ``fixed_goal=True``. ``model``
     is shared with other environments of the task: do not change it.
 
     ## Version History

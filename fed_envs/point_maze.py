@@ -12,8 +12,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from fed_envs.clients import PointMazeClient
 from fed_envs.mazes import WALL, cell_center, distances, maze_rows
-from fed_envs.metadata import Family, PointMazeClient
+from fed_envs.metadata import Family
 from fed_envs.mujoco_world import MujocoBatch, MujocoClientEnv
 from fed_envs.world import Runner, ScriptedPolicy, run_here
 

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from fed_envs.metadata import REACHER_GOAL_LIMIT, Family, ReacherClient
+from fed_envs.clients import REACHER_GOAL_LIMIT, ReacherClient
+from fed_envs.metadata import Family
 from fed_envs.mujoco_world import MujocoBatch, MujocoClientEnv
 
 

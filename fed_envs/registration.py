@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
+
+if TYPE_CHECKING:
+    from fed_envs.clients import Client
 
 METADATA_FOLDER = Path(__file__).parent / "metadata"
 
@@ -20,8 +24,8 @@ ENTRY_POINTS = {
     "point_maze": "fed_envs.point_maze:PointMazeEnv",
 }
 
-#: Names of the families that ship with the package, one metadata file each.
-FAMILIES: tuple[str, ...] = tuple(sorted(path.stem for path in METADATA_FOLDER.glob("*.json")))
+#: Every family's metadata file by its name: those that ship with the package, and those that a user registers.
+FAMILIES: dict[str, Path] = {path.stem: path for path in sorted(METADATA_FOLDER.glob("*.json"))}
 
 
 def environment_id(family: str) -> str:
@@ -37,13 +41,47 @@ def environment_class(world: str) -> Any:
 
 def register_families() -> None:
     """Register every shipped family with Gymnasium; the second call does nothing."""
-    for family in FAMILIES:
-        if environment_id(family) in gymnasium.registry:
-            continue
-        content = json.loads((METADATA_FOLDER / f"{family}.json").read_text(encoding="utf-8"))
-        gymnasium.register(
-            id=environment_id(family),
-            entry_point=ENTRY_POINTS[content["world"]],
-            max_episode_steps=content["max_episode_steps"],
-            kwargs={"family": family},
-        )
+    for family, path in FAMILIES.items():
+        if environment_id(family) not in gymnasium.registry:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            _register(family, content["world"], content["max_episode_steps"])
+
+
+def register_world(world: str, entry_point: str, client_model: type[Client], backbones: tuple[str, ...]) -> None:
+    """Make a kind of world of one's own known, so that metadata files can name it.
+
+    :param world: the metadata's ``world``
+    :param entry_point: ``"module:Class"`` of a :class:`fed_envs.world.ClientEnv`
+    :param client_model: what a client's entry has to say
+    :param backbones: what the metadata's ``backbone`` may be
+    :raises ValueError: for a name that means something else already
+    """
+    from fed_envs.clients import BACKBONES, CLIENT_MODELS
+
+    if ENTRY_POINTS.get(world, entry_point) != entry_point:
+        raise ValueError(f"the world {world!r} is taken by {ENTRY_POINTS[world]}; choose another name")
+    ENTRY_POINTS[world], CLIENT_MODELS[world], BACKBONES[world] = entry_point, client_model, backbones
+
+
+def register_family(path: str | os.PathLike[str]) -> None:
+    """Register a family of one's own by its metadata file: by name everywhere, and ``fed_envs/<Family>-v0`` in Gymnasium.
+
+    :raises ValueError: for a file that does not follow the schema, or a name that means something else already
+    """
+    from fed_envs.metadata import read_family
+
+    family, file = read_family(path), Path(path).absolute()
+    if FAMILIES.get(family.name, file) != file:
+        raise ValueError(f"the family {family.name} is registered already, from {FAMILIES[family.name]}; choose another name")
+    FAMILIES[family.name] = file
+    if environment_id(family.name) not in gymnasium.registry:
+        _register(family.name, family.world, family.max_episode_steps)
+
+
+def _register(family: str, world: str, max_episode_steps: int) -> None:
+    gymnasium.register(
+        id=environment_id(family),
+        entry_point=ENTRY_POINTS[world],
+        max_episode_steps=max_episode_steps,
+        kwargs={"family": family},
+    )

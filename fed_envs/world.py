@@ -15,7 +15,8 @@ import gymnasium
 import numpy as np
 from pydantic import ValidationError
 
-from fed_envs.metadata import Client, Family, describe, load_family, parse_family
+from fed_envs.clients import Client
+from fed_envs.metadata import Family, describe, load_family, parse_family
 
 EnvT = TypeVar("EnvT", bound="ClientEnv")
 ClientT = TypeVar("ClientT", bound=Client)

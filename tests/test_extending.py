@@ -3,23 +3,44 @@
 from __future__ import annotations
 
 import json
+import pickle
 import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
+import fed_envs
+from fed_envs import FederatedVecEnv
+from fed_envs.metadata import parse_family
 from sb3_fedguide.algorithms import ALGORITHMS, register_algorithm
 from sb3_fedguide.cli.train import main
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs" / "examples"
 SMALL = ["--rounds", "2", "-params", "rollout_size:60", "batch_size:20", "n_envs_per_client:2", "bc_weight:0"]
+WINDS = np.array([[0.05, 0.0], [0.0, 0.05], [-0.05, 0.0]])
 
 
-def test_the_page_shows_the_file():
-    code = (EXAMPLES / "half_averaging.py").read_text().split("\n\n", 2)[2]
+@pytest.fixture
+def registries():
+    """What the example registers is forgotten again."""
+    from fed_envs import clients, registration
+
+    kept = registration.FAMILIES, registration.ENTRY_POINTS, clients.CLIENT_MODELS, clients.BACKBONES
+    before = [dict(registry) for registry in kept]
+    yield
+    for registry, content in zip(kept, before, strict=True):
+        registry.clear()
+        registry.update(content)
+
+
+@pytest.mark.parametrize("name", ["half_averaging", "wind_world"])
+def test_the_page_shows_the_file(name):
+    code = (EXAMPLES / f"{name}.py").read_text().split("\n\n", 2)[2]
     assert code.strip() in (ROOT / "docs" / "extending.md").read_text()
 
 
@@ -57,3 +78,39 @@ def test_a_missing_module_is_one_message(capsys, tmp_path):
     assert main(["--gym-packages", "no_such_module", "--env", "Bandit2D", "-f", str(tmp_path / "logs")]) == 2
     assert "--gym-packages no_such_module" in capsys.readouterr().err
     assert not (tmp_path / "logs").exists()
+
+
+def test_the_example_world_keeps_the_contracts(monkeypatch, registries):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    env = gymnasium.make("wind_world:fed_envs/Wind-v0", client=2)
+    check_env(env.unwrapped, skip_render_check=True)
+    assert env.unwrapped.client.wind == (-0.05, 0.0)
+    clients = FederatedVecEnv("Wind", n_envs_per_client=2)
+    assert clients.n_clients == 3
+    clients.seed(0)
+    first = clients.reset()
+    pickled = pickle.loads(pickle.dumps(clients))
+    actions = np.full((6, 2), 0.3, dtype=np.float32)
+    for one, other in zip(clients.step(actions)[:2], pickled.step(actions)[:2], strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(clients.step(actions)[0] - first, 2 * (0.03 + np.repeat(WINDS, 2, axis=0)), atol=1e-6)
+    with pytest.raises(ValueError, match=r"client 0 .*wind"):
+        parse_family({**json.loads((EXAMPLES / "Wind.json").read_text()), "clients": [{"client": 0, "wind": "north"}]}, "file")
+
+
+def test_fedguide_trains_in_the_example_world(tmp_path):
+    command = [sys.executable, str(ROOT / "train.py"), "--gym-packages", "wind_world", "--env", "Wind", "-f", str(tmp_path)]
+    command += [*SMALL[:-1], "pretraining.dataset_size:200", "pretraining.bc_updates:5", "pretraining.prior_updates:5"]
+    command += ["pretraining.dice_updates:5", "prior_states:20"]
+    result = subprocess.run(command, cwd=EXAMPLES, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    summary = json.loads((tmp_path / "fedguide" / "Wind_1" / "summary.json").read_text())
+    assert summary["n_clients"] == 3 and summary["rounds_done"] == 2
+
+
+def test_taken_names_of_worlds_and_families_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="taken"):
+        fed_envs.register_world("reacher", "somewhere:Else", fed_envs.Client, ("Reacher-v5",))
+    fed_envs.load_family("Reacher").dump(tmp_path / "other.json")
+    with pytest.raises(ValueError, match="registered already"):
+        fed_envs.register_family(tmp_path / "other.json")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fed_envs
-from fed_envs import metadata
+from fed_envs import clients, metadata
 from fed_envs.generation import PAPER_SEEDS, generate_family
 from fed_envs.metadata import Family, load_family, parse_family, read_family
 from fed_envs.metadata_command import main
@@ -154,7 +154,7 @@ def test_generated_families_are_valid_reproducible_and_all_different(name):
     assert family.n_clients == 30
     assert family.content_hash == generate_family(name, 30, seed=1).content_hash
     if name == "Bandit2D":
-        assert [client.peak for client in family.clients] == [metadata.BANDIT2D_PEAKS[k % 4] for k in range(30)]
+        assert [client.peak for client in family.clients] == [clients.BANDIT2D_PEAKS[k % 4] for k in range(30)]
     else:
         assert family.content_hash != generate_family(name, 30, seed=2, name=family.name).content_hash
         assert len({client.model_copy(update={"client": 0}) for client in family.clients}) == 30

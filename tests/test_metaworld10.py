@@ -16,7 +16,8 @@ from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 from metaworld.policies import ENV_POLICY_MAP
 
 import fed_envs
-from fed_envs.metadata import METAWORLD_TASKS, parse_family
+from fed_envs.clients import METAWORLD_TASKS
+from fed_envs.metadata import parse_family
 from fed_envs.metaworld10 import MetaWorldEnv
 
 FAMILY = fed_envs.load_family("MetaWorld10")
