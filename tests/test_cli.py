@@ -238,7 +238,11 @@ def test_an_interrupted_run_keeps_what_there_is(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(recorder.CostCallback, "_on_round_end", interrupt)
     argv = ["--algo", "fedavg", "--env", "Bandit2D", "--rounds", "30", "--eval-freq", "1", "-f", str(tmp_path), *NO_OFFLINE]
-    assert main([*argv, "--verbose", "0"]) == 130
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a shell ignores it
+    try:
+        assert main([*argv, "--verbose", "0"]) == 130
+    finally:
+        signal.signal(signal.SIGINT, handler)
     assert "interrupted in round" in capsys.readouterr().err
     folder = tmp_path / "fedavg" / "Bandit2D_1"
     summary = json.loads((folder / "summary.json").read_text())
