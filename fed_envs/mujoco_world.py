@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import Any
@@ -54,7 +55,7 @@ class MujocoClientEnv(ClientEnv[ClientT]):
         self._start()
 
     def _apply_parameters(self) -> None:
-        raise NotImplementedError
+        """Change the model to the client's, where its parameters concern the model."""
 
     def _scale_mass_and_damping(self, mass_scale: float, damping_scale: float) -> None:
         """Scale all bodies' masses but the world's, and all joints' damping; inertias stay as they are (as in the paper)."""
@@ -70,8 +71,9 @@ class MujocoClientEnv(ClientEnv[ClientT]):
         self.data.qvel[:] = qvel
         mujoco.mj_forward(self.model, self.data)
 
+    @abstractmethod
     def _camera(self) -> dict[str, Any]:
-        raise NotImplementedError
+        """MuJoCo's camera settings for pictures."""
 
     def render(self) -> Any:
         if self._renderer is None:
@@ -132,13 +134,13 @@ class MujocoBatch(Batch[EnvT]):
         run(self._simulate, rows)
         self._evaluate()
 
+    @abstractmethod
     def _apply(self, actions: np.ndarray) -> None:
         """Fill ``self.applied`` from the policy's actions ``(n, nu)``."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _evaluate(self) -> None:
         """Fill ``observations``, ``rewards`` and ``terminated`` from what was read."""
-        raise NotImplementedError
 
     def observe(self, row: int) -> np.ndarray:
         """The observation of one environment's present state, ``(observation_dim,)``."""
@@ -149,5 +151,6 @@ class MujocoBatch(Batch[EnvT]):
         self._observe()
         return self.observations[row].copy()
 
+    @abstractmethod
     def _observe(self) -> None:
-        raise NotImplementedError
+        """Fill ``observations`` from what was read."""

@@ -66,7 +66,7 @@ class Batch(ABC, Generic[EnvT]):
         return [{} for _ in self.envs]
 
 
-class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], Generic[ClientT]):
+class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], ABC, Generic[ClientT]):
     """One client's environment.
 
     :param client: the client's id

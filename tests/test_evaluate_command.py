@@ -48,12 +48,11 @@ def test_other_episodes_and_sampled_actions_give_other_returns(runs, tmp_path):
     assert sampled == again
 
 
-def test_pictures_of_every_client(runs, tmp_path, monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    monkeypatch.setattr("sb3_fedguide.cli.evaluate.MAX_FRAMES", 5)
-    evaluated(runs["local"], "--video", str(tmp_path / "video"), output=tmp_path / "result.json")
+def test_pictures_of_every_client(tmp_path):
+    assert main(["train", "--algo", "local", "--env", "Bandit2D", "-f", str(tmp_path), *SMALL]) == 0  # draws without OpenGL
+    evaluated(tmp_path / "local" / "Bandit2D_1", "--video", str(tmp_path / "video"), output=tmp_path / "result.json")
     pictures = sorted((tmp_path / "video").iterdir())
-    assert len(pictures) == 8
+    assert len(pictures) == 4
     assert all(picture.read_bytes().startswith(b"GIF8") for picture in pictures)
 
 
@@ -78,6 +77,16 @@ def test_wrong_input_is_one_line_and_exit_code_2(runs, flags, message, tmp_path,
     assert stop.value.code == 2
     error = capsys.readouterr().err
     assert message in error and len(error.splitlines()) == 1
+
+
+def test_a_video_without_display_or_driver_is_one_message(runs, tmp_path, monkeypatch, capsys):
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(SystemExit) as stop:
+        main(["evaluate", str(runs["local"]), "--video", str(tmp_path / "video")])
+    assert stop.value.code == 2 and "MUJOCO_GL=osmesa" in capsys.readouterr().err
+    assert not (tmp_path / "video").exists()
 
 
 def test_success_rates_are_evaluated_beside_returns():

@@ -9,7 +9,7 @@ import torch as th
 from fed_envs import FederatedVecEnv
 from sb3_fedguide import FedAvg, FedGuide, FedGuideA, FedGuideP, Local
 from sb3_fedguide.common import gaussian
-from sb3_fedguide.common.policies import ACTOR_PREFIXES
+from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES
 from sb3_fedguide.common.value_blend import explained_variances, optimal_blend
 from sb3_fedguide.priors.base import score_cost
 from sb3_fedguide.priors.importance import importance_weights

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch as th
 
-from sb3_fedguide.algorithms.fedavg import AVERAGED_PREFIXES, FedAvg
+from sb3_fedguide.algorithms.fedavg import FedAvg
 from sb3_fedguide.common.anchors import Parameters, snapshot
 from sb3_fedguide.common.buffers import FederatedSamples
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
@@ -34,7 +34,7 @@ class AnchoredFedAvg(FedAvg):
 
     def _initialize_anchor(self) -> None:
         if not self.anchor:
-            self.anchor = snapshot(self.policy, AVERAGED_PREFIXES[self.average])
+            self.anchor = snapshot(self.policy, self.averaged_prefixes)
 
 
 class FedProx(AnchoredFedAvg):

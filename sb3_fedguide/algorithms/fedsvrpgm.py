@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch as th
 
-from sb3_fedguide.algorithms.fedavg import AVERAGED_PREFIXES, FedAvg
+from sb3_fedguide.algorithms.fedavg import FedAvg
 from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.anchors import Parameters, actor_at, snapshot
 from sb3_fedguide.common.buffers import FederatedSamples
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
-from sb3_fedguide.common.policies import ACTOR_PREFIXES, StackedActor
+from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES, StackedActor
 from sb3_fedguide.server.strategy import Payload, Strategy
 from sb3_fedguide.server.svrpg import DIRECTION, SVRPG
 
@@ -72,7 +72,7 @@ class FedSVRPGM(FedAvg):
             self.directions = {name: array.copy() for name, array in self.momentum.items()}
 
     def _make_strategy(self) -> Strategy:
-        return SVRPG(AVERAGED_PREFIXES[self.average], self.average_every, self.average_until)
+        return SVRPG(self.averaged_prefixes, self.average_every, self.average_until)
 
     def upload(self, index: int) -> Payload:
         """Parameters and number of samples as in FedAvg, and ``direction.<actor parameter>``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -201,6 +202,9 @@ def _check_rendering(family: Family) -> None:
     env.close()
     if "rgb_array" not in modes:
         raise ValueError(f"--video: {family.name} cannot be drawn")
+    display = sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"))
+    if not display and family.world != "bandit2d":  # MuJoCo's default would end the process
+        raise ValueError("--video: there is no display; set MUJOCO_GL=osmesa (Debian: libosmesa6) or MUJOCO_GL=egl")
 
 
 def _write_videos(folder: Path, policy: str, family: Family, model: Federation, seed: int) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch as th
 
-from sb3_fedguide.common.policies import StackedActor, StackedMlpPolicy
+from sb3_fedguide.common.ppo_policy import StackedActor, StackedMlpPolicy
 
 #: Parameters of all clients by SB3's name, ``(n_clients, ...)`` each; arrays, so that a saved model loads on any device.
 Parameters = dict[str, np.ndarray]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from typing import Any
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -13,7 +12,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from sb3_fedguide.common.stacked import client_state, stack_module
+from sb3_fedguide.common.stacked_policy import StackedPolicy, check_spaces
 
 ACTOR_PREFIXES = ("actor.",)
 CRITIC_PREFIXES = ("critic.",)
@@ -39,7 +38,7 @@ class BoundedActor(nn.Module):
         return self.low + 0.5 * (self.mu(obs) + 1.0) * (self.high - self.low)
 
 
-class StackedDDPGPolicy(TD3Policy):
+class StackedDDPGPolicy(StackedPolicy, TD3Policy):
     """The ``MlpPolicy`` of SB3's ``DDPG`` for ``n_clients`` clients at once.
 
     Parameters keep SB3's names and gain a leading client dimension, so client k's slice of the state dict is the state
@@ -54,6 +53,9 @@ class StackedDDPGPolicy(TD3Policy):
     :raises ValueError: for spaces other than flat ``Box`` observations and ``Box`` actions, or several critics
     """
 
+    actor_prefixes = ACTOR_PREFIXES
+    critic_prefixes = CRITIC_PREFIXES
+
     def __init__(
         self,
         observation_space: spaces.Space,
@@ -67,12 +69,7 @@ class StackedDDPGPolicy(TD3Policy):
         optimizer_kwargs: dict[str, Any] | None = None,
         n_critics: int = 1,
     ) -> None:
-        for name, space in (("observation", observation_space), ("action", action_space)):
-            if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-                raise ValueError(
-                    f"a federation needs one-dimensional Box spaces, but the {name} space is {space}; "
-                    "flatten it (gymnasium.wrappers.FlattenObservation) or use a continuous action space"
-                )
+        check_spaces(observation_space, action_space)
         if n_critics != 1:
             raise ValueError(f"n_critics={n_critics}: DDPG has one critic per client; leave n_critics out")
         self.n_clients = n_clients
@@ -105,9 +102,6 @@ class StackedDDPGPolicy(TD3Policy):
         self.actor_parameters = list(self.actor.parameters())
         self._networks = [*self.actor.parameters(), *self.critic.parameters()]
         self._targets = [*self.actor_target.parameters(), *self.critic_target.parameters()]
-
-    def _stacked(self, module: nn.Module) -> Any:
-        return stack_module(module, self.n_clients)
 
     def actions(self, obs: th.Tensor) -> th.Tensor:
         """``(n_clients, batch, obs_dim)`` to actions in [-1, 1], ``(n_clients, batch, action_dim)``."""
@@ -156,20 +150,6 @@ class StackedDDPGPolicy(TD3Policy):
         """This policy's parameter that a :class:`BoundedActor` calls ``name``."""
         return self.get_parameter(f"actor.{name}")
 
-    def split_clients(self, obs: th.Tensor) -> th.Tensor:
-        """``(n_clients * batch, obs_dim)``, client-major, to ``(n_clients, batch, obs_dim)``.
-
-        :raises ValueError: where the rows cannot be divided among the clients
-        """
-        if obs.dim() == 3 and obs.shape[0] == self.n_clients:
-            return obs
-        if obs.shape[0] % self.n_clients:
-            raise ValueError(
-                f"{obs.shape[0]} observation(s) cannot be divided among {self.n_clients} clients; pass the same number for "
-                "each, client by client, or take one client's own model with client(k)"
-            )
-        return obs.reshape(self.n_clients, -1, obs.shape[-1])
-
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         assert isinstance(observation, th.Tensor)
         return self.actions(self.split_clients(observation)).flatten(0, 1)
@@ -179,19 +159,3 @@ class StackedDDPGPolicy(TD3Policy):
         data: dict[str, Any] = {key: getattr(self, key) for key in keys}
         data.update(observation_space=self.observation_space, action_space=self.action_space, lr_schedule=self._dummy_schedule)
         return data
-
-    def client_state_dict(self, index: int) -> dict[str, th.Tensor]:
-        """State dict of the ordinary policy of the client at position ``index``; copies, not aliases."""
-        return client_state(self.state_dict(), index)
-
-    @th.no_grad()
-    def load_client(self, index: int, arrays: dict[str, np.ndarray]) -> None:
-        """Copy parameters, named as in SB3 and unstacked, into the client at position ``index``.
-
-        :raises ValueError: for an unknown name or a wrong shape
-        """
-        parameters = dict(self.named_parameters())
-        for name, array in arrays.items():
-            if name not in parameters or parameters[name].shape[1:] != array.shape:
-                raise ValueError(f"parameter {name!r} of shape {array.shape} does not fit this policy")
-            parameters[name][index].copy_(th.as_tensor(array))

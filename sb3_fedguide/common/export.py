@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_fedguide.common.normalization import FederatedNormalizer
-from sb3_fedguide.common.policies import StackedMlpPolicy
+from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG

@@ -5,21 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from fed_envs import FederatedVecEnv
-from sb3_fedguide.common.callbacks import round_callbacks
 from sb3_fedguide.common.ddpg_policy import BoundedActor, StackedDDPGPolicy
-from sb3_fedguide.common.ddpg_settings import check_settings
 from sb3_fedguide.common.export import client_ddpg, export_program
 from sb3_fedguide.common.federation import Federation, FederationLike, as_federated_env
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
@@ -29,8 +27,6 @@ from sb3_fedguide.common.replay import FederatedReplayBuffer
 from sb3_fedguide.common.seeding import Role, integer_seed
 from sb3_fedguide.common.training_log import RoundStatistics
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
-
-SelfFederatedDDPG = TypeVar("SelfFederatedDDPG", bound="FederatedDDPG")
 
 
 class FederatedDDPG(Federation, DDPG):
@@ -133,7 +129,7 @@ class FederatedDDPG(Federation, DDPG):
             _init_setup_model=False,
         )
         self._stats_window_size = stats_window_size
-        check_settings(self)
+        _check_settings(self)
         if _init_setup_model:
             self._setup_model()
 
@@ -178,52 +174,20 @@ class FederatedDDPG(Federation, DDPG):
         super()._initialize_from_behavior_cloning(stage)
         self.policy.copy_to_targets()
 
-    def learn(
-        self: SelfFederatedDDPG,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfFederatedDDPG:
-        """Train for ``total_timesteps`` steps of all clients together, rounded up to whole rounds; otherwise as in SB3."""
-        self.pretrain(progress_bar)
-        reset = reset_num_timesteps or self._last_obs is None
-        # SB3's loop knows no rounds: its rollouts are single steps, and it logs by episodes.
-        total_timesteps, callbacks = self._setup_learn(
-            total_timesteps,
-            self._round_callbacks(callback, total_timesteps, progress_bar),
-            reset_num_timesteps,
-            tb_log_name or type(self).__name__,
-        )
-        if reset_num_timesteps:
-            self.round = 0
-        if reset:
+    def _begin_learning(self, environments_were_reset: bool) -> None:
+        super()._begin_learning(environments_were_reset)
+        if environments_were_reset:
             self.noise.reset()
-        self._begin_learning(environments_were_reset=reset)
-        rounds = list(round_callbacks(callbacks))
-        callbacks.on_training_start(locals(), globals())
-        while self.num_timesteps < total_timesteps:
-            started = time.perf_counter()
-            self._statistics, self._training_seconds = RoundStatistics(), 0.0
-            self._draw_participants()
-            for hook in rounds:
-                hook.on_round_start()
-            if not self.collect_rollouts(self.env, callbacks, self.rollout_size // self.n_envs_per_client):  # type: ignore
-                break
-            self.logger.record("time/rollout", time.perf_counter() - started - self._training_seconds)
-            self.logger.record("time/train", self._training_seconds)
-            self._record_training()
-            for hook in rounds:
-                hook.on_local_training_end()
-            self.round += 1
-            for hook in rounds:
-                hook.on_round_end()
-            if log_interval is not None and self.round % log_interval == 0:
-                self.dump_logs(self.round)
-        callbacks.on_training_end()
-        return self
+
+    def _train_round(self, callbacks: BaseCallback) -> bool:
+        started = time.perf_counter()
+        self._statistics, self._training_seconds = RoundStatistics(), 0.0
+        if not self.collect_rollouts(self.env, callbacks, self.rollout_size // self.n_envs_per_client):  # type: ignore
+            return False
+        self.logger.record("time/rollout", time.perf_counter() - started - self._training_seconds)
+        self.logger.record("time/train", self._training_seconds)
+        self._record_training()
+        return True
 
     def collect_rollouts(  # type: ignore[override]
         self, env: FederatedVecEnv, callback: BaseCallback, n_rollout_steps: int
@@ -235,12 +199,13 @@ class FederatedDDPG(Federation, DDPG):
         present = None if self.present.all() else self.present
         callback.on_rollout_start()
         noise = self._noise_draws(n_rollout_steps)
+        n_active = int(env.active.sum())
         raw_obs = self._last_obs.reshape(*shape, -1)  # type: ignore[union-attr]
         for step in range(n_rollout_steps):
             scaled_actions = self._explore(raw_obs, noise[step])
             actions = self.policy.unscale_action(scaled_actions).reshape(env.num_envs, -1)
             new_raw_obs, raw_rewards, flat_dones, infos = env.step(actions)
-            self.num_timesteps += int(env.active.sum())
+            self.num_timesteps += n_active
             self.client_steps[self.present] += self.n_envs_per_client
             callback.update_locals(locals())
             if not callback.on_step():
@@ -364,3 +329,31 @@ class FederatedDDPG(Federation, DDPG):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer", "normalizer"], []
+
+
+def _check_settings(model: FederatedDDPG) -> None:
+    """:raises ValueError: for settings out of range or that do not fit together, with the remedy"""
+    rollout_size, n_envs = model.rollout_size, model.n_envs_per_client
+    if rollout_size < 1 or rollout_size % n_envs:
+        raise ValueError(f"n_envs_per_client={n_envs} must divide rollout_size={rollout_size}, the steps per client and round")
+    if model.train_freq < 1 or (rollout_size // n_envs) % model.train_freq:
+        raise ValueError(
+            f"train_freq={model.train_freq} must be at least 1 and divide the {rollout_size // n_envs} steps of every "
+            "environment in a round (rollout_size / n_envs_per_client)"
+        )
+    if model.gradient_steps < 1 and model.gradient_steps != -1:
+        raise ValueError(
+            f"gradient_steps={model.gradient_steps} must be at least 1, or -1 for as many as there are new transitions"
+        )
+    if model.batch_size < 1 or model.learning_starts < 0:
+        raise ValueError(
+            f"batch_size={model.batch_size} must be at least 1 and learning_starts={model.learning_starts} at least 0"
+        )
+    if model.buffer_size <= model.learning_starts:
+        raise ValueError(
+            f"buffer_size={model.buffer_size} must be larger than learning_starts={model.learning_starts}; both are per client"
+        )
+    if not 0 < model.tau <= 1:
+        raise ValueError(f"tau={model.tau} must lie in (0, 1]")
+    if min(model.noise_theta, model.noise_sigma) < 0 or model.noise_dt <= 0:
+        raise ValueError("noise_theta and noise_sigma must not be negative, and noise_dt must be positive")

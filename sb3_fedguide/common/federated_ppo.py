@@ -6,61 +6,27 @@ import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypedDict, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.buffers import FederatedRolloutBuffer, FederatedSamples, check_sizes, generalized_advantage
-from sb3_fedguide.common.callbacks import round_callbacks
 from sb3_fedguide.common.federation import Federation, FederationLike, PolicyLike, as_federated_env
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.participation import ParticipationAdam
-from sb3_fedguide.common.policies import StackedMlpPolicy
+from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 from sb3_fedguide.common.seeding import Role, integer_seed
 from sb3_fedguide.common.stacked import clip_grad_norm_per_client
 from sb3_fedguide.common.training_log import RoundStatistics, record_training
 from sb3_fedguide.offline.pretraining import PretrainingConfig
-
-SelfFederatedPPO = TypeVar("SelfFederatedPPO", bound="FederatedPPO")
-
-
-class FederatedPPOArguments(TypedDict, total=False):
-    """Keyword arguments of :class:`FederatedPPO` that its subclasses hand on; the constructor states their defaults."""
-
-    learning_rate: float | Schedule
-    rollout_size: int
-    batch_size: int
-    n_epochs: int
-    gamma: float
-    gae_lambda: float
-    clip_range: float | Schedule
-    clip_range_vf: float | Schedule | None
-    normalize_advantage: bool
-    ent_coef: float
-    vf_coef: float
-    max_grad_norm: float
-    n_envs_per_client: int
-    clients: Sequence[int] | None
-    normalize: bool
-    bc_weight: float
-    client_fraction: float
-    pretraining: PretrainingConfig | dict[str, Any] | None
-    cache_dir: str | Path | None
-    stats_window_size: int
-    tensorboard_log: str | None
-    policy_kwargs: dict[str, Any] | None
-    verbose: int
-    seed: int | None
-    device: th.device | str
-    _init_setup_model: bool
 
 
 class FederatedPPO(Federation, PPO):
@@ -210,51 +176,16 @@ class FederatedPPO(Federation, PPO):
     def _transform_gradients(self, data: FederatedSamples) -> None:
         """Change ``parameter.grad`` in place, before clipping."""
 
-    def learn(
-        self: SelfFederatedPPO,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfFederatedPPO:
-        """Train for ``total_timesteps`` steps of all clients together, rounded up to whole rounds; otherwise as in SB3."""
-        self.pretrain(progress_bar)
-        reset = reset_num_timesteps or self._last_obs is None
-        # SB3 logs before train() and offers no event after it, so the loop is our own: rollout, train, exchange, log.
-        total_timesteps, callbacks = self._setup_learn(
-            total_timesteps,
-            self._round_callbacks(callback, total_timesteps, progress_bar),
-            reset_num_timesteps,
-            tb_log_name or type(self).__name__,
-        )
-        if reset_num_timesteps:
-            self.round = 0
-        self._begin_learning(environments_were_reset=reset)
-        rounds = list(round_callbacks(callbacks))
-        callbacks.on_training_start(locals(), globals())
-        while self.num_timesteps < total_timesteps:
-            started = time.perf_counter()
-            self._draw_participants()
-            for hook in rounds:
-                hook.on_round_start()
-            if not self.collect_rollouts(self.env, callbacks, self.rollout_buffer, self.n_steps):  # type: ignore[arg-type]
-                break
-            self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
-            collected = time.perf_counter()
-            self.train()
-            self.logger.record("time/rollout", collected - started)
-            self.logger.record("time/train", time.perf_counter() - collected)
-            for hook in rounds:
-                hook.on_local_training_end()
-            self.round += 1
-            for hook in rounds:
-                hook.on_round_end()
-            if log_interval is not None and self.round % log_interval == 0:
-                self.dump_logs(self.round)
-        callbacks.on_training_end()
-        return self
+    def _train_round(self, callbacks: BaseCallback) -> bool:
+        started = time.perf_counter()
+        if not self.collect_rollouts(self.env, callbacks, self.rollout_buffer, self.n_steps):  # type: ignore[arg-type]
+            return False
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        collected = time.perf_counter()
+        self.train()
+        self.logger.record("time/rollout", collected - started)
+        self.logger.record("time/train", time.perf_counter() - collected)
+        return True
 
     def collect_rollouts(  # type: ignore[override]
         self, env: FederatedVecEnv, callback: BaseCallback, rollout_buffer: FederatedRolloutBuffer, n_rollout_steps: int
@@ -267,6 +198,7 @@ class FederatedPPO(Federation, PPO):
         shape = (self.n_clients, self.n_envs_per_client)
         low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
         noise = self._exploration_noise(n_rollout_steps)
+        n_active = int(env.active.sum())
         raw_obs = self._last_obs.reshape(*shape, -1)  # type: ignore[union-attr]
         obs = self.normalizer.normalize_obs(raw_obs)
         starts = self._last_episode_starts.reshape(shape)
@@ -278,7 +210,7 @@ class FederatedPPO(Federation, PPO):
             actions = mean + noise[step]
             flat_actions = np.clip(actions, low, high).reshape(env.num_envs, -1)
             new_raw_obs, raw_rewards, flat_dones, infos = env.step(flat_actions)
-            self.num_timesteps += int(env.active.sum())
+            self.num_timesteps += n_active
             callback.update_locals(locals())
             if not callback.on_step():
                 return False

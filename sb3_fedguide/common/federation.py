@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -20,18 +21,19 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from fed_envs import FederatedVecEnv
-from sb3_fedguide.common.callbacks import ExchangeCallback, RoundProgressCallback
+from sb3_fedguide.common.callbacks import ExchangeCallback, RoundProgressCallback, round_callbacks
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
 from sb3_fedguide.common.export import client_model, export_client
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.participation import draw_participants, n_participants
-from sb3_fedguide.common.policies import StackedMlpPolicy
+from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
 from sb3_fedguide.server.strategy import Payload, Strategy
 
 PolicyLike = str | type[ActorCriticPolicy]
 FederationLike = str | Path | Any | Sequence[Callable[[], gym.Env]]
+SelfFederation = TypeVar("SelfFederation", bound="Federation")
 
 
 class Federation(BaseAlgorithm):
@@ -181,6 +183,50 @@ class Federation(BaseAlgorithm):
         with th.no_grad():
             for name, tensor in cloned.items():
                 self.policy.actor_parameter(name).lerp_(tensor.to(self.device), self.bc_weight)
+
+    def learn(
+        self: SelfFederation,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfFederation:
+        """Train for ``total_timesteps`` steps of all clients together, rounded up to whole rounds; otherwise as in SB3."""
+        self.pretrain(progress_bar)
+        reset = reset_num_timesteps or self._last_obs is None
+        # SB3 offers no event after train(), and off policy it knows no rounds, so the loop is our own: train, exchange, log.
+        total_timesteps, callbacks = self._setup_learn(
+            total_timesteps,
+            self._round_callbacks(callback, total_timesteps, progress_bar),
+            reset_num_timesteps,
+            tb_log_name or type(self).__name__,
+        )
+        if reset_num_timesteps:
+            self.round = 0
+        self._begin_learning(environments_were_reset=reset)
+        rounds = list(round_callbacks(callbacks))
+        callbacks.on_training_start(locals(), globals())
+        while self.num_timesteps < total_timesteps:
+            self._draw_participants()
+            for hook in rounds:
+                hook.on_round_start()
+            if not self._train_round(callbacks):
+                break
+            for hook in rounds:
+                hook.on_local_training_end()
+            self.round += 1
+            for hook in rounds:
+                hook.on_round_end()
+            if log_interval is not None and self.round % log_interval == 0:
+                self.dump_logs(self.round)
+        callbacks.on_training_end()
+        return self
+
+    @abstractmethod
+    def _train_round(self, callbacks: BaseCallback) -> bool:
+        """One round's experience and gradient steps of those present; false where a callback ended the training."""
 
     def _round_callbacks(self, callback: MaybeCallback, total_timesteps: int, progress_bar: bool) -> CallbackList:
         """The exchange first, then the user's callbacks, which see its result, then the progress bar."""

@@ -6,6 +6,7 @@ distance between two clients' scores is a quadratic form in the difference of th
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +46,7 @@ class HeadStatistics:
     __rmul__ = __mul__
 
 
-class Prior(nn.Module):
+class Prior(nn.Module, ABC):
     """A density over actions given an observation, with a linear head (a client's whole contribution).
 
     Randomness always comes from the ``numpy.random.Generator`` that is passed in. Nothing here needs gradients.
@@ -66,6 +67,7 @@ class Prior(nn.Module):
         """Shape ``(action_dim, p + 1)`` of a head; the last column is the bias."""
         return (self.action_dim, self.n_features + 1)
 
+    @abstractmethod
     def head_statistics(
         self,
         obs: np.ndarray,
@@ -82,11 +84,10 @@ class Prior(nn.Module):
         :param n_draws: noise draws per row, where the prior needs any
         :raises ValueError: for empty data, wrong shapes, non-finite values or weights that are negative or sum to zero
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def solve_head(self, statistics: HeadStatistics) -> np.ndarray:
         """The head that fits ``statistics`` best, float32, shape :attr:`head_shape`."""
-        raise NotImplementedError
 
     def fit_head(
         self, obs: np.ndarray, actions: np.ndarray, rng: np.random.Generator, weights: np.ndarray | None = None
@@ -94,13 +95,14 @@ class Prior(nn.Module):
         """The head of one client's data in closed form: :meth:`solve_head` of :meth:`head_statistics`."""
         return self.solve_head(self.head_statistics(obs, actions, rng, weights))
 
+    @abstractmethod
     def feature_moment(self, obs: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """``S = E[f f^T]`` of the score cost, with whatever turns the head's output into a score: see :func:`score_cost`.
 
         :return: float64, ``(p + 1, p + 1)``. It never leaves the client.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def log_prob(
         self, head: np.ndarray | th.Tensor, obs: th.Tensor, actions: th.Tensor, n_steps: int | None = None
     ) -> th.Tensor:
@@ -112,8 +114,8 @@ class Prior(nn.Module):
         :param n_steps: integration steps, where the prior integrates
         :return: ``(batch,)``, or ``(n_experts, batch)`` for several heads
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def sample(
         self,
         head: np.ndarray | th.Tensor,
@@ -130,7 +132,6 @@ class Prior(nn.Module):
         :param n_steps: denoising steps, where the prior denoises
         :return: ``(batch, action_dim)``, not clipped
         """
-        raise NotImplementedError
 
     # Shared checks and conversions
 

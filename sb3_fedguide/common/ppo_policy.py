@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from typing import Any
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -14,7 +13,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_fedguide.common import gaussian
-from sb3_fedguide.common.stacked import client_state, stack_module, stack_tensor
+from sb3_fedguide.common.stacked import stack_tensor
+from sb3_fedguide.common.stacked_policy import StackedPolicy, check_spaces
 
 ACTOR_PREFIXES = ("mlp_extractor.policy_net.", "action_net.", "log_std")
 CRITIC_PREFIXES = ("mlp_extractor.value_net.", "value_net.")
@@ -32,7 +32,7 @@ class StackedActor(nn.Module):
         return self.action_net(self.policy_net(obs))
 
 
-class StackedMlpPolicy(ActorCriticPolicy):
+class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
     """SB3's ``MlpPolicy`` for ``n_clients`` clients at once.
 
     Parameters keep SB3's names and gain a leading client dimension, so client k's slice of the state dict is the state
@@ -46,6 +46,9 @@ class StackedMlpPolicy(ActorCriticPolicy):
     :param log_std_init: initial value of the state-independent log standard deviation
     :raises ValueError: for spaces other than flat ``Box`` observations and ``Box`` actions
     """
+
+    actor_prefixes = ACTOR_PREFIXES
+    critic_prefixes = CRITIC_PREFIXES
 
     def __init__(
         self,
@@ -62,12 +65,7 @@ class StackedMlpPolicy(ActorCriticPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        for name, space in (("observation", observation_space), ("action", action_space)):
-            if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-                raise ValueError(
-                    f"a federation needs one-dimensional Box spaces, but the {name} space is {space}; "
-                    "flatten it (gymnasium.wrappers.FlattenObservation) or use a continuous action space"
-                )
+        check_spaces(observation_space, action_space)
         if use_sde:
             raise ValueError("use_sde=True is not supported by lockstep policies; use the default Gaussian exploration")
         self.n_clients = n_clients
@@ -96,9 +94,6 @@ class StackedMlpPolicy(ActorCriticPolicy):
         self.log_std = nn.Parameter(stack_tensor(self.log_std, self.n_clients))
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
-    def _stacked(self, module: nn.Module) -> Any:
-        return stack_module(module, self.n_clients)
-
     def _build_mlp_extractor(self) -> None:
         # On the CPU first, so that one seed gives one initial network on every device.
         self.mlp_extractor = MlpExtractor(
@@ -120,20 +115,6 @@ class StackedMlpPolicy(ActorCriticPolicy):
     def actor_parameter(self, name: str) -> nn.Parameter:
         """This policy's parameter that a :class:`StackedActor` calls ``name``."""
         return self.get_parameter(name if name.startswith("action_net.") else f"mlp_extractor.{name}")
-
-    def split_clients(self, obs: th.Tensor) -> th.Tensor:
-        """``(n_clients * batch, obs_dim)``, client-major, to ``(n_clients, batch, obs_dim)``.
-
-        :raises ValueError: where the rows cannot be divided among the clients
-        """
-        if obs.dim() == 3 and obs.shape[0] == self.n_clients:
-            return obs
-        if obs.shape[0] % self.n_clients:
-            raise ValueError(
-                f"{obs.shape[0]} observation(s) cannot be divided among {self.n_clients} clients; pass the same number for "
-                "each, client by client, or take one client's own model with client(k)"
-            )
-        return obs.reshape(self.n_clients, -1, obs.shape[-1])
 
     def forward(self, obs: th.Tensor, deterministic: bool = False) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Actions, values and log-probabilities, client-major and flat as SB3 returns them."""
@@ -168,19 +149,3 @@ class StackedMlpPolicy(ActorCriticPolicy):
         data: dict[str, Any] = {key: getattr(self, key) for key in keys}
         data.update(observation_space=self.observation_space, action_space=self.action_space, lr_schedule=self._dummy_schedule)
         return data
-
-    def client_state_dict(self, index: int) -> dict[str, th.Tensor]:
-        """State dict of the ordinary ``MlpPolicy`` of the client at position ``index``; copies, not aliases."""
-        return client_state(self.state_dict(), index)
-
-    @th.no_grad()
-    def load_client(self, index: int, arrays: dict[str, np.ndarray]) -> None:
-        """Copy parameters, named as in SB3 and unstacked, into the client at position ``index``.
-
-        :raises ValueError: for an unknown name or a wrong shape
-        """
-        parameters = dict(self.named_parameters())
-        for name, array in arrays.items():
-            if name not in parameters or parameters[name].shape[1:] != array.shape:
-                raise ValueError(f"parameter {name!r} of shape {array.shape} does not fit this policy")
-            parameters[name][index].copy_(th.as_tensor(array))

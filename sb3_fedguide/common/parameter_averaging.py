@@ -1,0 +1,57 @@
+"""The client's side of parameter averaging, for learners of any kind."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from sb3_fedguide.common.federation import Federation
+from sb3_fedguide.server.averaging import Averaging
+from sb3_fedguide.server.strategy import N_SAMPLES, Payload, Strategy
+
+AVERAGE_CHOICES = ("all", "actor", "critic")
+
+
+class ParameterAveraging(Federation):
+    """Mixin for methods that average policy parameters; optimiser state and normalisation stay with their client."""
+
+    shares_policy: ClassVar[bool] = True
+
+    def _init_averaging(
+        self, average: Literal["all", "actor", "critic"], average_every: int, average_until: int | None
+    ) -> None:
+        """Called by a subclass's constructor, before its base's."""
+        if average not in AVERAGE_CHOICES:
+            raise ValueError(f"average={average!r} must be one of {', '.join(AVERAGE_CHOICES)}")
+        if average_every < 1:
+            raise ValueError(f"average_every={average_every} must be at least 1 round")
+        self.average: Literal["all", "actor", "critic"] = average
+        self.average_every = average_every
+        self.average_until = average_until
+
+    @property
+    def averaged_prefixes(self) -> tuple[str, ...]:
+        """How the names of the parameters begin that are averaged."""
+        actor, critic = self.policy.actor_prefixes, self.policy.critic_prefixes
+        return {"all": actor + critic, "actor": actor, "critic": critic}[self.average]
+
+    def _make_strategy(self) -> Strategy:
+        return Averaging(self.averaged_prefixes, self.average_every, self.average_until)
+
+    def upload(self, index: int) -> Payload:
+        return policy_upload(self, index, self.averaged_prefixes)
+
+    def receive(self, index: int, broadcast: Payload) -> None:
+        self.policy.load_client(index, broadcast)
+
+
+def policy_upload(model: Federation, index: int, prefixes: tuple[str, ...]) -> Payload:
+    """Copies of a client's parameters under SB3's names, and the number of samples behind them."""
+    payload: Payload = {
+        name: parameter[index].detach().cpu().numpy().copy()
+        for name, parameter in model.policy.named_parameters()
+        if name.startswith(prefixes)
+    }
+    payload[N_SAMPLES] = np.array(model.rollout_size, dtype=np.float32)
+    return payload
