@@ -17,7 +17,7 @@ from stable_baselines3.td3.td3 import TD3
 from fed_envs import FederatedVecEnv
 from sb3_fedguide import FederatedDDPG, FedRL
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
-from sb3_fedguide.common.replay import FederatedReplayBuffer
+from sb3_fedguide.common.replay_buffer import FederatedReplayBuffer
 from sb3_fedguide.common.seeding import Role
 from tests.conftest import assert_same_parameters, parameters_of
 

@@ -15,8 +15,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide import FederatedPPO, Local
-from sb3_fedguide.common.buffers import generalized_advantage
 from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.rollout_buffer import generalized_advantage
 from sb3_fedguide.common.seeding import Role
 from sb3_fedguide.common.stacked import clip_grad_norm_per_client
 from tests.conftest import assert_same_parameters, parameters_of

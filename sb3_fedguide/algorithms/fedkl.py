@@ -8,8 +8,8 @@ import torch as th
 from sb3_fedguide.algorithms.fedprox import AnchoredFedAvg
 from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.anchors import actor_at
-from sb3_fedguide.common.buffers import FederatedSamples
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
+from sb3_fedguide.common.rollout_buffer import FederatedSamples
 
 
 class FedKL(AnchoredFedAvg):

@@ -7,8 +7,8 @@ import torch as th
 
 from sb3_fedguide.algorithms.fedavg import FedAvg
 from sb3_fedguide.common.anchors import Parameters, snapshot
-from sb3_fedguide.common.buffers import FederatedSamples
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
+from sb3_fedguide.common.rollout_buffer import FederatedSamples
 from sb3_fedguide.server.strategy import Payload
 
 

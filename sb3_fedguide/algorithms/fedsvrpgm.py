@@ -8,9 +8,9 @@ import torch as th
 from sb3_fedguide.algorithms.fedavg import FedAvg
 from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.anchors import Parameters, actor_at, snapshot
-from sb3_fedguide.common.buffers import FederatedSamples
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES, StackedActor
+from sb3_fedguide.common.rollout_buffer import FederatedSamples
 from sb3_fedguide.server.strategy import Payload, Strategy
 from sb3_fedguide.server.svrpg import DIRECTION, SVRPG
 

@@ -23,7 +23,7 @@ from sb3_fedguide.common.federation import Federation, FederationLike, as_federa
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.participation import ParticipationAdam
-from sb3_fedguide.common.replay import FederatedReplayBuffer
+from sb3_fedguide.common.replay_buffer import FederatedReplayBuffer
 from sb3_fedguide.common.seeding import Role, integer_seed
 from sb3_fedguide.common.training_log import RoundStatistics
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig

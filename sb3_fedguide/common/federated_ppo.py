@@ -18,11 +18,11 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide.common import gaussian
-from sb3_fedguide.common.buffers import FederatedRolloutBuffer, FederatedSamples, check_sizes, generalized_advantage
 from sb3_fedguide.common.federation import Federation, FederationLike, PolicyLike, as_federated_env
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
+from sb3_fedguide.common.rollout_buffer import FederatedRolloutBuffer, FederatedSamples, check_sizes, generalized_advantage
 from sb3_fedguide.common.seeding import Role, integer_seed
 from sb3_fedguide.common.stacked import clip_grad_norm_per_client
 from sb3_fedguide.common.training_log import RoundStatistics, record_training
