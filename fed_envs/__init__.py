@@ -41,6 +41,7 @@ _SUBMODULES = (
     "metaworld10",
     "point_maze",
     "reacher",
+    "state",
     "vec_env",
 )
 

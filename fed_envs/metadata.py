@@ -16,7 +16,6 @@ import difflib
 import hashlib
 import json
 import os
-import tempfile
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,6 +25,7 @@ from gymnasium.envs.registration import EnvSpec
 from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationError, field_validator, model_validator
 
 from fed_envs.clients import BACKBONES, CLIENT_MODELS, Client
+from fed_envs.files import atomic_file
 from fed_envs.registration import ENTRY_POINTS, FAMILIES, environment_id
 
 SCHEMA_VERSION: Literal[1] = 1
@@ -144,18 +144,8 @@ class Family(BaseModel):
 
     def dump(self, path: str | os.PathLike[str]) -> None:
         """Write the metadata file; it appears complete or not at all."""
-        target = Path(path)
-        descriptor, temporary = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
-        try:
-            with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-                file.write(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
-            umask = os.umask(0)
-            os.umask(umask)
-            os.chmod(temporary, 0o666 & ~umask)  # mkstemp makes files private
-            os.replace(temporary, target)
-        except BaseException:
-            os.unlink(temporary)
-            raise
+        with atomic_file(path) as file:
+            file.write(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
 
 
 def describe(error: ValidationError) -> list[str]:
@@ -213,7 +203,7 @@ def read_family(path: str | os.PathLike[str]) -> Family:
         raise ValueError(f"cannot read the metadata file {path}: {getattr(error, 'strerror', None) or error}") from None
     try:
         content = json.loads(text, object_pairs_hook=_refuse_duplicate_keys)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON: {error}") from None
     return parse_family(content, str(path))
 

@@ -20,15 +20,16 @@ from fed_envs.clients import MetaWorldClient
 from fed_envs.metadata import Family
 from fed_envs.mujoco_world import MujocoClientEnv
 from fed_envs.seeding import stream
+from fed_envs.state import freeze, thaw
 from fed_envs.world import Batch, Runner, ScriptedPolicy, run_here
 
 OBSERVATION_DIM = 39
 FIXED_GOAL_SEED = 0
 #: What the data's scripted policies are clipped to, and the standard deviation of their noise before the tanh.
 SCRIPT_LIMIT, SCRIPT_NOISE = 0.9, 0.3
-_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 # Attributes of metaworld's environment that belong to one object, not to its state.
 _OWN = ("model", "data", "mujoco_renderer", "_np_random")
+_ABSENT = object()
 
 
 class SharedModel:
@@ -247,33 +248,41 @@ class MetaWorldEnv(MujocoClientEnv[MetaWorldClient]):
             mujoco.mj_kinematics(self.model, self.data)  # a reset moves bodies without placing them
             return super().render()
 
-    def __getstate__(self) -> dict[str, Any]:
-        state = super().__getstate__()
-        for name in ("sawyer", "model", "data", "_shared", "_fresh"):
-            del state[name]
-        return {**state, "_simulation": self._simulation_state()}
+    def save_state(self) -> dict[str, Any]:
+        """The simulator's state, where the bodies of the shared model are, and metaworld's attributes.
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        positions, simulation = state["_positions"], state.pop("_simulation")
-        self.client = state["client"]
-        self._make_sawyer()
-        self.__dict__.update(state)
-        with self._shared.at(positions):
-            self._restore(simulation)
-        super().__setstate__({})
-
-    def _simulation_state(self) -> dict[str, Any]:
-        """The simulator's state, and metaworld's attributes; some of them are views into the simulator's memory."""
-        state = np.zeros(mujoco.mj_stateSize(self.model, _STATE))
-        mujoco.mj_getState(self.model, self.data, state, _STATE)
+        Some attributes are views into the simulator's memory, kept as the array's name and a row. Those that are no plain
+        data are the same in every environment of the task.
+        """
         attributes, views = {}, {}
         for name, value in self.sawyer.__dict__.items():
             source = self._viewed(value)
             if source is not None:
                 views[name] = source
-            elif name not in _OWN:
+            elif name in _OWN or isinstance(value, spaces.Space):
+                continue
+            elif isinstance(value, np.ndarray) or value is not self._fresh.get(name, _ABSENT):
                 attributes[name] = value
-        return {"state": state, "attributes": attributes, "views": views}
+        return {
+            **super().save_state(),
+            "positions": self._positions,
+            "success": self.success,
+            "succeeded": self.succeeded,
+            "attributes": attributes,
+            "views": views,
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        self._positions = state["positions"]
+        self.success, self.succeeded = state["success"], state["succeeded"]
+        sawyer = self.sawyer
+        sawyer.__dict__.clear()
+        sawyer.__dict__.update(self._fresh)
+        sawyer.__dict__.update(state["attributes"])
+        for name, (source, index) in state["views"].items():
+            setattr(sawyer, name, getattr(self.data, source)[index])
+        with self._shared.at(self._positions):
+            super().load_state(state)
 
     def _viewed(self, value: Any) -> tuple[str, int] | None:
         if not isinstance(value, np.ndarray) or value.base is None:
@@ -285,10 +294,16 @@ class MetaWorldEnv(MujocoClientEnv[MetaWorldClient]):
                 return name, offset // positions.strides[0]
         return None
 
-    def _restore(self, simulation: dict[str, Any]) -> None:
-        self.sawyer.__dict__.update(simulation["attributes"])
-        for name, (source, index) in simulation["views"].items():
-            setattr(self.sawyer, name, getattr(self.data, source)[index])
-        mujoco.mj_setState(self.model, self.data, simulation["state"], _STATE)
-        mujoco.mj_forward(self.model, self.data)  # fills what follows from the state, and changes where the solver starts
-        mujoco.mj_setState(self.model, self.data, simulation["state"], _STATE)
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        for name in ("sawyer", "model", "data", "_shared", "_fresh"):
+            del state[name]
+        return {**state, "_saved": freeze(self.save_state())}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        saved = thaw(state.pop("_saved"))
+        self.client = state["client"]
+        self._make_sawyer()
+        self.__dict__.update(state)
+        self.load_state(saved)
+        super().__setstate__({})

@@ -15,6 +15,10 @@ from gymnasium.envs.mujoco.mujoco_env import expand_model_path
 
 from fed_envs.world import Batch, ClientEnv, ClientT, EnvT, Runner, run_here
 
+#: What of MuJoCo's data determines the steps to come.
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+FRAMES = ("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat")
+
 
 @lru_cache(maxsize=8)
 def _compiled(xml_file: str) -> mujoco.MjModel:
@@ -70,6 +74,25 @@ class MujocoClientEnv(ClientEnv[ClientT]):
         self.data.qpos[:] = qpos
         self.data.qvel[:] = qvel
         mujoco.mj_forward(self.model, self.data)
+
+    def save_state(self) -> dict[str, Any]:
+        state = np.zeros(mujoco.mj_stateSize(self.model, STATE))
+        mujoco.mj_getState(self.model, self.data, state, STATE)
+        # Frames lag behind the generalised positions by one simulation step, and rewards read them.
+        return {"simulation": state, **{name: getattr(self.data, name).copy() for name in FRAMES}}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        size = mujoco.mj_stateSize(self.model, STATE)
+        if state["simulation"].shape != (size,):
+            raise ValueError(
+                f"the state of {self.family.name}'s client {self.client.client} has {state['simulation'].size} numbers "
+                f"instead of {size}: it is of another model or version of MuJoCo"
+            )
+        mujoco.mj_setState(self.model, self.data, state["simulation"], STATE)
+        mujoco.mj_forward(self.model, self.data)  # fills what follows from the state, and changes where the solver starts
+        mujoco.mj_setState(self.model, self.data, state["simulation"], STATE)
+        for name in FRAMES:
+            getattr(self.data, name)[:] = state[name]
 
     @abstractmethod
     def _camera(self) -> dict[str, Any]:

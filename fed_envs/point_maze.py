@@ -182,6 +182,15 @@ class PointMazeEnv(MujocoClientEnv[PointMazeClient]):
         self.succeeded = False
         return observation, {"success": self.success, "is_success": False}
 
+    def save_state(self) -> dict[str, Any]:
+        return {**super().save_state(), "goal": self.goal, "success": self.success, "succeeded": self.succeeded}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        self.goal[:] = state["goal"]
+        self.model.site("target").pos[:2] = self.goal
+        self.success, self.succeeded = state["success"], state["succeeded"]
+        super().load_state(state)
+
     def _camera(self) -> dict[str, Any]:
         return {"distance": 12.5 if len(self.rows) > 8 else 8.8}  # gymnasium-robotics'
 

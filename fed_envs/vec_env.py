@@ -17,12 +17,17 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from fed_envs.faults import ClientError, RowError, run_rows, watched
 from fed_envs.metadata import Family, load_family
 from fed_envs.registration import environment_class
 from fed_envs.seeding import integer_seed
+from fed_envs.state import State, load_state, save_state
 from fed_envs.world import Batch, Runner, run_here
 
 EnvFactory = Callable[[], gymnasium.Env]
+
+#: To wake a thread costs as much as some five steps of a simulator, so each is given at least this many.
+MIN_ROWS_PER_THREAD = 8
 
 
 class FactoryBatch(Batch[Any]):
@@ -33,9 +38,14 @@ class FactoryBatch(Batch[Any]):
         self._infos: list[dict[str, Any]] = [{} for _ in envs]
 
     def step(self, actions: np.ndarray, rows: Sequence[int], run: Runner = run_here) -> None:
-        for row in rows:
-            result = self.envs[row].step(actions[row])
-            self.observations[row], self.rewards[row], self.terminated[row], self.truncated[row], self._infos[row] = result
+        row, shape = -1, self.observations.shape[1:]
+        try:
+            for row in rows:
+                result = self.envs[row].step(actions[row])
+                check_shape(result[0], shape)
+                self.observations[row], self.rewards[row], self.terminated[row], self.truncated[row], self._infos[row] = result
+        except Exception as error:
+            raise RowError(row) from error
 
     def info(self, row: int) -> dict[str, Any]:
         return dict(self._infos[row])
@@ -60,7 +70,8 @@ class FederatedVecEnv(VecEnv):
         an environment, one per client (those are stepped one by one, and their infos are passed on)
     :param n_envs_per_client: copies of each client's environment
     :param clients: ids of the clients that live here; all by default
-    :param num_threads: threads that step the simulators; the result does not depend on it
+    :param num_threads: at most so many threads step the simulators, each at least eight of them; the result does not depend
+        on it. Two pay on an idle machine; on a busy one they wait for each other.
     :param role: which of a federation's random streams to use (training, evaluation, ...), see :meth:`seed`
     :param render_mode: ``"rgb_array"`` or ``"human"``
     :raises ValueError: for unknown families and clients, and for environments whose spaces differ
@@ -158,10 +169,21 @@ class FederatedVecEnv(VecEnv):
         return self._batch.observations.copy()
 
     def _reset_row(self, row: int, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        observation, self.reset_infos[row] = self.envs[row].reset(seed=seed, options=options or None)
+        try:
+            observation, self.reset_infos[row] = self.envs[row].reset(seed=seed, options=options or None)
+            if self.family is None:
+                check_shape(observation, self._batch.observations.shape[1:])
+        except Exception as error:
+            raise self._fault([row], "reset()", error) from error
         self._batch.observations[row] = observation
         self._lengths[row] = 0
         self._returns[row] = 0.0
+
+    def _fault(self, rows: Sequence[int], call: str, error: Exception) -> ClientError:
+        """What to raise for an exception that came out of the environments ``rows``."""
+        clients = sorted({row // self.n_envs_per_client for row in rows})
+        reason = f"{call} of its environment raised {type(error).__name__}: {error}"
+        return ClientError([self.client_ids[client] for client in clients], reason)
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
@@ -180,11 +202,18 @@ class FederatedVecEnv(VecEnv):
         if not np.isfinite(actions if all_active else actions[active]).all():
             # The simulator would warn in a log file and go on without any torque.
             row = next(row for row in rows if not np.isfinite(actions[row]).all())
-            raise ValueError(
-                f"client {self.client_ids[row // self.n_envs_per_client]}: the action {actions[row]} is not finite"
-            )
+            seen, client = batch.observations[row], self.client_ids[row // self.n_envs_per_client]
+            if not np.isfinite(seen).all():
+                raise ClientError([client], f"its environment returned the observation {seen}, which is not finite")
+            raise ClientError([client], f"the action {actions[row]} is not finite")
         before = None if all_active else batch.observations[~active]
-        batch.step(actions, rows, self._run if self.num_threads > 1 else run_here)
+        try:
+            batch.step(actions, rows, self._run)
+        except RowError as fault:
+            assert isinstance(fault.__cause__, Exception)
+            raise self._fault([fault.row], "step()", fault.__cause__) from fault.__cause__
+        except Exception as error:  # of a world that steps all its environments at once
+            raise self._fault(rows, "step()", error) from error
 
         rewards, terminated = batch.rewards, batch.terminated
         self._lengths += active
@@ -211,13 +240,49 @@ class FederatedVecEnv(VecEnv):
 
     def _run(self, work: Callable[[Iterator[int]], None], rows: Sequence[int]) -> None:
         """Let the threads share one iterator, so that none waits while another still has several environments to step."""
+        threads = min(self.num_threads, len(rows) // MIN_ROWS_PER_THREAD)
+        if threads < 2:
+            return run_rows(work, rows)
         if self._pool is None:
             self._pool = ThreadPoolExecutor(self.num_threads - 1, thread_name_prefix="fed_envs")
-        shared = iter(rows)
-        others = [self._pool.submit(work, shared) for _ in range(min(self.num_threads, len(rows)) - 1)]
+        shared, work = iter(rows), watched(work)
+        others = [self._pool.submit(work, shared) for _ in range(threads - 1)]
         work(shared)
         for other in others:
             other.result()
+
+    def save_state(self) -> State:
+        """Where all environments stand, as plain data: simulators, random streams, running returns, who is active.
+
+        :raises ValueError: for environments of the user's own without ``save_state`` and ``load_state``
+        """
+        return {
+            "clients": list(self.client_ids),
+            "envs": [save_state(env) for env in self.envs],
+            "observations": self._batch.observations.copy(),
+            "lengths": self._lengths.copy(),
+            "returns": self._returns.copy(),
+            "active": self._active.copy(),
+            "seeds": list(self._seeds),
+            "seconds": time.time() - self._start_time,
+        }
+
+    def load_state(self, state: State) -> None:
+        """Bring new environments of the same clients to where :meth:`save_state` was called.
+
+        :raises ValueError: for the state of other environments
+        """
+        if state["clients"] != self.client_ids or len(state["envs"]) != self.num_envs:
+            raise ValueError(
+                f"the state is that of {len(state['envs'])} environments of the clients {state['clients']}, not of "
+                f"{self.num_envs} of the clients {self.client_ids}"
+            )
+        for env, saved in zip(self.envs, state["envs"], strict=True):
+            load_state(env, saved)
+        self._batch.observations[:] = state["observations"]
+        self._lengths[:], self._returns[:], self._active[:] = state["lengths"], state["returns"], state["active"]
+        self._seeds = list(state["seeds"])
+        self._start_time = time.time() - state["seconds"]
 
     def close(self) -> None:
         if self._pool is not None:
@@ -259,6 +324,12 @@ class FederatedVecEnv(VecEnv):
 
     def _targets(self, indices: VecEnvIndices) -> list[gymnasium.Env]:
         return [self.envs[index] for index in self._get_indices(indices)]
+
+
+def check_shape(observation: Any, shape: tuple[int, ...]) -> None:
+    """:raises ValueError: for an observation of another shape, which NumPy may stretch without a word"""
+    if np.shape(observation) != shape:
+        raise ValueError(f"the observation has the shape {np.shape(observation)}, the observation space {shape}")
 
 
 def _checked_clients(clients: Sequence[int] | None, n_clients: int, name: str) -> list[int]:

@@ -17,9 +17,12 @@ from pydantic import ValidationError
 
 from fed_envs.clients import Client
 from fed_envs.metadata import Family, describe, load_family, parse_family
+from fed_envs.state import IDENTITY, attributes, set_attributes
 
 EnvT = TypeVar("EnvT", bound="ClientEnv")
 ClientT = TypeVar("ClientT", bound=Client)
+
+_IDENTITY = (*IDENTITY, "family", "client", "_batch")
 
 #: Actions ``(n, action_dim)`` float32 for observations ``(n, obs_dim)`` and a generator.
 ScriptedPolicy = Callable[[np.ndarray, np.random.Generator], np.ndarray]
@@ -135,6 +138,18 @@ class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], ABC, Generic[ClientT]):
             self.render()
         # The time limit belongs to Gymnasium's wrapper, so this is never a truncation.
         return batch.observations[0].copy(), float(batch.rewards[0]), bool(batch.terminated[0]), False, batch.info(0)
+
+    def save_state(self) -> dict[str, Any]:
+        """Where the episode stands, without the random generator: arrays, JSON values, and lists and dicts of these.
+
+        Worlds whose state is more than the plain attributes of the environment override it and :meth:`load_state`; see
+        :func:`fed_envs.state.save_state` for the whole state of an environment and its wrappers.
+        """
+        return attributes(self, _IDENTITY)
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on from what :meth:`save_state` returned, on an environment of the same client."""
+        set_attributes(self, state)
 
     def __getstate__(self) -> dict[str, Any]:
         state = self.__dict__.copy()

@@ -24,9 +24,12 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.evaluation import FederatedEvalCallback, evaluate_federation
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
+    from sb3_fedguide.monitoring.callbacks import TensorBoardCallback
+    from sb3_fedguide.monitoring.diagnostics import DiagnosticsCallback
 
 _LAZY = {
     "register_algorithm": "sb3_fedguide.algorithms",
+    "DiagnosticsCallback": "sb3_fedguide.monitoring.diagnostics",
     "FedAvg": "sb3_fedguide.algorithms.fedavg",
     "FedGuide": "sb3_fedguide.algorithms.fedguide",
     "FedGuideA": "sb3_fedguide.algorithms.fedguide",
@@ -36,6 +39,7 @@ _LAZY = {
     "FedRL": "sb3_fedguide.algorithms.fedrl",
     "FedSVRPGM": "sb3_fedguide.algorithms.fedsvrpgm",
     "Local": "sb3_fedguide.algorithms.local",
+    "TensorBoardCallback": "sb3_fedguide.monitoring.callbacks",
     "FederatedDDPG": "sb3_fedguide.common.federated_ddpg",
     "FederatedEvalCallback": "sb3_fedguide.common.evaluation",
     "FederatedPPO": "sb3_fedguide.common.federated_ppo",
@@ -44,6 +48,7 @@ _LAZY = {
 
 __version__ = "0.1.0"
 __all__ = [
+    "DiagnosticsCallback",
     "FedAvg",
     "FedGuide",
     "FedGuideA",
@@ -56,6 +61,7 @@ __all__ = [
     "FederatedEvalCallback",
     "FederatedPPO",
     "Local",
+    "TensorBoardCallback",
     "__version__",
     "evaluate_federation",
     "register_algorithm",

@@ -152,7 +152,7 @@ def test_a_run_folder_says_what_was_run(local_run):
     names = {path.name for path in local_run.iterdir()}
     assert names == {
         "args.yml", "command.txt", "config.yml", "evaluations.csv", "metadata.json", "metadata.sha256", "model.zip",
-        "summary.json", "tb", "versions.json",
+        "parameters.npz", "summary.json", "tb", "versions.json",
     }  # fmt: skip
     config = yaml.safe_load((local_run / "config.yml").read_text())
     assert (config["n_epochs"], config["bc_weight"], config["n_rounds"], config["rollout_size"]) == (2, 0, 2, 200)

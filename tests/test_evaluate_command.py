@@ -59,19 +59,19 @@ def test_pictures_of_every_client(tmp_path):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["{folder}/nothing"], "it has no model.zip"),
+        (["{folder}/nothing"], "it has no summary.json"),
         (["{run}", "--episodes", "0"], "--episodes must be at least 1"),
         (["{run}", "--policy", "broadcast"], "no broadcast one"),
         (["{run}", "-o", "{folder}/missing/result.json"], "there is no folder"),
-        (["{damaged}"], "model.zip cannot be read"),
+        (["{damaged}"], "parameters.npz is damaged"),
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(runs, flags, message, tmp_path, capsys):
     damaged = tmp_path / "damaged"
     damaged.mkdir()
-    for name in ("summary.json", "metadata.json"):
+    for name in ("summary.json", "metadata.json", "config.yml"):
         (damaged / name).write_bytes((runs["local"] / name).read_bytes())
-    (damaged / "model.zip").write_bytes(b"PK nothing")
+    (damaged / "parameters.npz").write_bytes(b"PK nothing")
     with pytest.raises(SystemExit) as stop:
         main(["evaluate", *(flag.format(folder=tmp_path, run=runs["local"], damaged=damaged) for flag in flags)])
     assert stop.value.code == 2

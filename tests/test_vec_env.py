@@ -16,7 +16,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecNormalize
 
 import fed_envs
-from fed_envs import FederatedVecEnv
+from fed_envs import FederatedVecEnv, vec_env
 from fed_envs.metadata import Family, parse_family
 from fed_envs.seeding import integer_seed
 
@@ -36,6 +36,12 @@ def actions_for(venv: FederatedVecEnv, steps: int, seed: int = 0) -> np.ndarray:
 
 def record(venv: FederatedVecEnv, actions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     return [venv.step(action)[:3] for action in actions]
+
+
+@pytest.fixture(autouse=True)
+def threads_for_few_environments(monkeypatch):
+    """Threads are for many environments; here a few of them are to meet threads as well."""
+    monkeypatch.setattr(vec_env, "MIN_ROWS_PER_THREAD", 1)
 
 
 def assert_same(first: list, second: list) -> None:

@@ -18,6 +18,9 @@ class FedAvg(ParameterAveraging, FederatedPPO):
     :param average: ``"all"``, only the ``"actor"`` (with ``log_std``), or only the ``"critic"``
     :param average_every: average after every so many rounds
     :param average_until: last round after which to average; ``None`` for no end
+    :param aggregator: ``"mean"``, or coordinate by coordinate the ``"median"`` or a ``"trimmed_mean"``, which a minority of
+        wrong uploads cannot move far; both ignore numbers of samples
+    :param trim_fraction: share of the clients that ``"trimmed_mean"`` leaves out at either end
 
     All other parameters are those of :class:`FederatedPPO`.
     """
@@ -29,7 +32,9 @@ class FedAvg(ParameterAveraging, FederatedPPO):
         average: Literal["all", "actor", "critic"] = "all",
         average_every: int = 1,
         average_until: int | None = None,
+        aggregator: Literal["mean", "median", "trimmed_mean"] = "mean",
+        trim_fraction: float = 0.25,
         **ppo: Unpack[FederatedPPOArguments],
     ) -> None:
-        self._init_averaging(average, average_every, average_until)
+        self._init_averaging(average, average_every, average_until, aggregator, trim_fraction)
         super().__init__(policy, env, **ppo)

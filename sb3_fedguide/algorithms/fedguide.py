@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar, Literal, Unpack
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import Schedule
 
+from fed_envs.state import State
 from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.arguments import FederatedPPOArguments
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.parameter_averaging import policy_upload
 from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES
+from sb3_fedguide.common.resumable import to_arrays, to_tensors
 from sb3_fedguide.common.rollout_buffer import FederatedSamples, generalized_advantage
 from sb3_fedguide.common.seeding import Role, seed_sequence
-from sb3_fedguide.common.value_blend import explained_variances, optimal_blend
+from sb3_fedguide.common.value_blend import baseline_figures, optimal_blend
 from sb3_fedguide.offline.dice import DiceValue, calibrate
 from sb3_fedguide.offline.pretraining import Pretraining
 from sb3_fedguide.priors.adaptation import HeadAdaptation
 from sb3_fedguide.priors.base import Prior, score_cost
 from sb3_fedguide.priors.importance import importance_weights
 from sb3_fedguide.priors.mixture import mixture_log_prob, mixture_sample
-from sb3_fedguide.server.averaging import Averaging
+from sb3_fedguide.priors.parameters import begin_parts, held_parts, part_arrays, set_part_arrays
+from sb3_fedguide.server.averaging import Averaging, averaging_is_due
 from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW, OTMoE
 from sb3_fedguide.server.strategy import Composite, Payload, Strategy
 
@@ -67,6 +71,7 @@ class FedGuide(FederatedPPO):
     """
 
     uses_dice: ClassVar[bool] = True
+    state_attributes = ("heads", "score_moments", "experts", "mixture_rows", "dice_scale", "calibrated")
 
     def __init__(
         self,
@@ -155,6 +160,23 @@ class FedGuide(FederatedPPO):
         if self.uses_dice:
             self.dice = stage.dice()
 
+    def save_state(self) -> State:
+        modules = {name: module and to_arrays(module.state_dict()) for name, module in self._frozen_modules().items()}
+        adaptation = self.adaptation and self.adaptation.save_state()
+        return {**super().save_state(), "parts": held_parts(self), "modules": modules, "adaptation": adaptation}
+
+    def load_state(self, state: State) -> None:
+        begin_parts(self, state["parts"], state["attributes"]["pretrained"])
+        for name, module in self._frozen_modules().items():
+            if module is not None:
+                module.load_state_dict(to_tensors(state["modules"][name]))
+        if self.adaptation is not None:
+            self.adaptation.load_state(state["adaptation"])
+        super().load_state(state)
+
+    def _frozen_modules(self) -> dict[str, th.nn.Module | None]:
+        return {"prior": self.prior, "dice": self.dice}
+
     def _compute_advantages(
         self, last_values: np.ndarray, truncation_values: np.ndarray, last_raw_obs: np.ndarray, dones: np.ndarray
     ) -> None:
@@ -201,10 +223,12 @@ class FedGuide(FederatedPPO):
         )
         if self.critic_target == "blend":
             buffer.returns[:] = buffer.advantages + blended
-        present = self.present
-        self.logger.record("dice/beta", float(beta[present].mean()))
-        for name, values in (("online", online), ("dice", dice), ("blend", buffer.rows(blended))):
-            self.logger.record(f"dice/explained_variance_{name}", float(explained_variances(values, returns)[present].mean()))
+        figures = {"beta": beta, **baseline_figures(returns, online, dice, buffer.rows(blended))}
+        for name, per_client in figures.items():
+            self.logger.record(f"dice/{name}", float(per_client[self.present].mean()))
+        for index in np.flatnonzero(self.present):
+            correlation = float(figures["residual_correlation"][index])
+            self.record_client(self.client_ids[index], "residual_correlation", correlation)
 
     def _dice_values(self, index: int, raw_obs: np.ndarray) -> np.ndarray:
         """V_phi of one client at raw observations ``(batch, obs_dim)``, in the scale of its rewards, ``(batch,)``."""
@@ -293,6 +317,9 @@ class FedGuide(FederatedPPO):
             losses["prior_loss"] = -self._prior_weight * prior_log_prob.mean(dim=1)
         return losses
 
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_old_log_std"]
+
     def _finish_training(self) -> None:
         if self.adaptation is None:
             return
@@ -306,6 +333,19 @@ class FedGuide(FederatedPPO):
             moved[i] = np.linalg.norm(head - self.heads[i]) / np.linalg.norm(self.heads[i])
             self.heads[i] = head
         self.logger.record("prior/head_change", float(moved[self.present].mean()))
+
+    def parameter_parts(self) -> list[str]:
+        return held_parts(self)
+
+    def begin_parts(self, parts: Sequence[str], pretrained: bool) -> None:
+        begin_parts(self, parts, pretrained)
+
+    def parameter_arrays(self) -> dict[str, np.ndarray]:
+        return {**super().parameter_arrays(), **part_arrays(self)}
+
+    def set_parameter_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        super().set_parameter_arrays(arrays)
+        set_part_arrays(self, arrays)
 
 
 class FedGuideP(FedGuide):
@@ -331,9 +371,12 @@ class FedGuideA(FedGuide):
     def _make_strategy(self) -> Strategy:
         return Composite([super()._make_strategy(), Averaging(ACTOR_PREFIXES, self.average_every)])
 
+    def sends_policy(self, round: int) -> bool:
+        return averaging_is_due(round, self.average_every)
+
     def upload(self, index: int) -> Payload:
         payload = super().upload(index)
-        if self.round > 0 and self.round % self.average_every == 0:
+        if self.sends_policy(self.round):
             payload.update(policy_upload(self, index, ACTOR_PREFIXES))
         return payload
 

@@ -19,6 +19,8 @@ class AnchoredFedAvg(FedAvg):
     :class:`FedAvg`.
     """
 
+    state_attributes = ("anchor",)
+
     def __init__(self, policy: PolicyLike, env: FederationLike | None, **fedavg: object) -> None:
         self.anchor: Parameters = {}  # theta_bar as each client last received it
         super().__init__(policy, env, **fedavg)  # type: ignore[arg-type]

@@ -23,6 +23,9 @@ class FedRL(ParameterAveraging, FederatedDDPG):
     :param average: ``"all"``, only the ``"actor"``, or only the ``"critic"``
     :param average_every: average after every so many rounds
     :param average_until: last round after which to average; ``None`` for no end
+    :param aggregator: ``"mean"``, or coordinate by coordinate the ``"median"`` or a ``"trimmed_mean"``, which a minority of
+        wrong uploads cannot move far; both ignore numbers of samples
+    :param trim_fraction: share of the clients that ``"trimmed_mean"`` leaves out at either end
 
     All other parameters are those of :class:`FederatedDDPG`.
     """
@@ -34,9 +37,11 @@ class FedRL(ParameterAveraging, FederatedDDPG):
         average: Literal["all", "actor", "critic"] = "all",
         average_every: int = 1,
         average_until: int | None = None,
+        aggregator: Literal["mean", "median", "trimmed_mean"] = "mean",
+        trim_fraction: float = 0.25,
         **ddpg: Unpack[FederatedDDPGArguments],
     ) -> None:
-        self._init_averaging(average, average_every, average_until)
+        self._init_averaging(average, average_every, average_until, aggregator, trim_fraction)
         super().__init__(policy, env, **ddpg)
 
     def receive(self, index: int, broadcast: Payload) -> None:

@@ -38,6 +38,8 @@ class FedSVRPGM(FedAvg):
     All other parameters are those of :class:`FedAvg`.
     """
 
+    state_attributes = ("reference", "reference_period", "momentum", "directions")
+
     def __init__(
         self,
         policy: PolicyLike,
@@ -72,7 +74,7 @@ class FedSVRPGM(FedAvg):
             self.directions = {name: array.copy() for name, array in self.momentum.items()}
 
     def _make_strategy(self) -> Strategy:
-        return SVRPG(self.averaged_prefixes, self.average_every, self.average_until)
+        return SVRPG(self.averaged_prefixes, self.average_every, self.average_until, self.aggregator, self.trim_fraction)
 
     def upload(self, index: int) -> Payload:
         """Parameters and number of samples as in FedAvg, and ``direction.<actor parameter>``."""

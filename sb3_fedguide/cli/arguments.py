@@ -48,10 +48,16 @@ def train_parser(prog: str) -> OneLineParser:
     flag("--eval-freq", type=int, default=5, metavar="ROUNDS", help="rounds between evaluations; the last twenty are all "
          "evaluated")  # fmt: skip
     flag("--eval-episodes", type=int, default=10, metavar="N", help="evaluation episodes per client")
+    flag("--eval-average", action="store_true", help="also evaluate the average of the clients' policies where the method "
+         "itself sends no policy")  # fmt: skip
     flag("--no-eval", action="store_true", help="do not evaluate")
+    flag("--save-freq", type=int, default=10, metavar="ROUNDS", help="rounds between checkpoints; 0: none")
+    flag("--resume", metavar="RUN", help="go on with the run in this folder, with its own settings")
+    flag("--picture-freq", type=int, default=20, metavar="ROUNDS", help="rounds between pictures in TensorBoard; 0: none")
     flag("-P", "--progress", action="store_true", help="progress bars")
     flag("--device", default="cpu", help="PyTorch device, e.g. cpu or cuda")
-    flag("--num-threads", type=int, default=1, metavar="N", help="threads of PyTorch; small networks gain nothing from more")
+    flag("--num-threads", type=int, default=1, metavar="N", help="threads that step the simulators (PyTorch takes one: small "
+         "networks gain nothing from more)")  # fmt: skip
     flag("--verbose", type=int, default=1, choices=(0, 1, 2), help="0: nothing but errors; 1: the log of each round (not "
          "beside progress bars); 2: always")  # fmt: skip
     return parser
@@ -77,7 +83,7 @@ def _unknown(argument: str, flags: Sequence[str]) -> str:
 
 def _problems(arguments: Any) -> list[str]:
     found = []
-    if arguments.env is None and arguments.metadata is None:
+    if arguments.env is None and arguments.metadata is None and arguments.resume is None:
         found.append("give the clients' environments with --env FAMILY, or --metadata FILE")
     if arguments.n_timesteps is not None and arguments.rounds is not None:
         found.append("-n/--n-timesteps and --rounds both say how long to train; give one of them")
@@ -85,6 +91,14 @@ def _problems(arguments: Any) -> list[str]:
         value = getattr(arguments, name)
         if value is not None and value < 1:
             found.append(f"--{name.replace('_', '-')} must be at least 1, not {value}")
+        if value is not None and value >= 2**63:
+            found.append(f"--{name.replace('_', '-')} must be below 2^63, but it has {len(str(value))} digits")
+    if arguments.save_freq < 0:
+        found.append(f"--save-freq must not be negative, not {arguments.save_freq}; 0 writes no checkpoints")
+    if arguments.eval_average and arguments.no_eval:
+        found.append("--eval-average and --no-eval contradict each other; give one of them")
+    if arguments.picture_freq < 0:
+        found.append(f"--picture-freq must not be negative, not {arguments.picture_freq}; 0 draws no pictures")
     if arguments.seed >= 2**31:
         found.append(f"--seed must be below 2^31, not {arguments.seed}")
     return found

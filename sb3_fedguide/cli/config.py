@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -32,6 +31,8 @@ BACKBONE_FAMILIES = {
 }  # fmt: skip
 
 DEFAULT = "default"
+#: Far more than any configuration needs: bytes of a file, and what its aliases may expand to.
+MAX_BYTES, MAX_NODES, MAX_DEPTH = 1_000_000, 20_000, 20
 NESTED = ("pretraining", "policy_kwargs")
 _SET_ELSEWHERE = {"gamma": "the DICE value takes the algorithm's own gamma"}
 
@@ -45,6 +46,11 @@ class _Loader(yaml.SafeLoader):
             if names.count(name) > 1:
                 raise yaml.YAMLError(f"the key {name!r} stands twice in one mapping, line {node.start_mark.line + 1}")
         return super().construct_mapping(node, deep)
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        super().flatten_mapping(node)
+        if len(node.value) > MAX_NODES:
+            raise yaml.YAMLError("its merged mappings hold too much for a configuration")
 
 
 _Loader.add_implicit_resolver(
@@ -84,7 +90,12 @@ class Config:
         with warnings.catch_warnings():
             # SB3 compares a client's batch_size with the steps of all clients; FederatedPPO has checked it against its own.
             warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
-            return algorithm(self.algo)(policy, env, policy_kwargs=network.to_kwargs(), **values, **arguments)
+            try:
+                return algorithm(self.algo)(policy, env, policy_kwargs=network.to_kwargs(), **values, **arguments)
+            except (MemoryError, RuntimeError) as error:
+                if isinstance(error, RuntimeError) and "allocate" not in str(error):
+                    raise
+                raise ValueError(f"there is not enough memory for a model with these settings: {error}") from None
 
 
 def resolve(
@@ -127,7 +138,7 @@ def resolve(
         from sb3_fedguide.common.participation import n_participants
 
         present = n_participants(values["client_fraction"], family.n_clients)
-        values["n_rounds"] = math.ceil(n_timesteps / (values["rollout_size"] * present))
+        values["n_rounds"] = -(-n_timesteps // (values["rollout_size"] * present))
     return Config(algo, applied, values)
 
 
@@ -195,18 +206,56 @@ def read_config(path: Path) -> dict[str, dict[str, Any]]:
 
     :raises ValueError: if it cannot be read or is something else
     """
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _Loader)  # a SafeLoader
-    except OSError as error:
-        raise ValueError(f"cannot read the configuration {path}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    content = read_yaml(path)
     if not isinstance(content, dict) or not all(isinstance(entry, dict) for entry in content.values()):
         raise ValueError(
             f"{path}: a configuration maps families (or {DEFAULT!r}) to their hyperparameters, "
             "e.g. 'HopperHard: {n_rounds: 100}'"
         )
     return content
+
+
+def read_yaml(path: Path) -> Any:
+    """A YAML file as plain data.
+
+    :raises ValueError: if it cannot be read, is no YAML, or is more than a configuration can be
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise ValueError(f"cannot read the configuration {path}: {error.strerror}") from None
+    if len(text) > MAX_BYTES:
+        raise ValueError(f"{path} is no configuration: it has more than {MAX_BYTES} bytes")
+    return _parse_yaml(text, str(path))
+
+
+def _parse_yaml(text: str | bytes, source: str) -> Any:
+    try:
+        value = yaml.load(text, _Loader)  # a SafeLoader
+        _check_extent(value)
+    except RecursionError:
+        raise ValueError(f"{source} is not valid YAML: it is nested too deeply") from None
+    except Exception as error:  # int(), float() and datetime inside the loader raise what they like
+        raise ValueError(f"{source} is not valid YAML: {' '.join(str(error).split()) or type(error).__name__}") from None
+    return value
+
+
+def _check_extent(value: Any) -> None:
+    """Refuse what a few lines with aliases can expand to.
+
+    :raises yaml.YAMLError: for data that are too many or nested too deeply
+    """
+    seen, waiting = 0, [(value, 0)]
+    while waiting:
+        item, depth = waiting.pop()
+        seen += 1
+        if seen > MAX_NODES or depth > MAX_DEPTH:
+            raise yaml.YAMLError("it holds too much, or is nested too deeply, for a configuration")
+        if isinstance(item, dict):
+            waiting += [(part, depth + 1) for pair in item.items() for part in pair]
+        elif isinstance(item, list | tuple | set):
+            waiting += [(part, depth + 1) for part in item]
 
 
 def parse_params(pairs: Sequence[str]) -> dict[str, Any]:
@@ -222,8 +271,8 @@ def parse_params(pairs: Sequence[str]) -> dict[str, Any]:
         if key in values:
             raise ValueError(f"-params gives {key!r} twice")
         try:
-            values[key] = yaml.load(text, _Loader)  # a SafeLoader
-        except yaml.YAMLError:
+            values[key] = _parse_yaml(text, key)
+        except ValueError:
             raise ValueError(f"-params {key}: {text!r} is not a number, text or [list]") from None
     return values
 

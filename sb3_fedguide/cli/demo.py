@@ -102,6 +102,6 @@ def _train(name: str, config: Config, family: Family, seed: int, progress: bool)
     evaluation, snapshot = RunEvalCallback(config.n_rounds, eval_freq=1), PolicySnapshot()
     total = config.n_rounds * model.rollout_size * model.n_clients
     model.learn(total, [evaluation, snapshot], progress_bar=progress)
-    shared = policies(model) if model.shares_policy else None
+    shared = policies(model) if model.sends_policy(model.round) else None
     final = evaluation.last["deployed"].average
     return model, MethodResult(name, snapshot.deployed, final, evaluation.curves["deployed"], shared)

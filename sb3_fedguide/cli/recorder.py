@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from sb3_fedguide.cli.signals import StopSignals
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback
+from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.evaluation import Evaluation, FederatedEvalCallback
 
 TIMES = ("rollout", "train", "exchange")
@@ -16,11 +18,25 @@ TIMES = ("rollout", "train", "exchange")
 class CostCallback(RoundCallback):
     """Adds up seconds by part of a round and the bytes that the exchange carried."""
 
+    state_attributes = ("seconds", "round_seconds", "pretraining_seconds", "total_seconds")
+
     def __init__(self) -> None:
         super().__init__()
         self.seconds = dict.fromkeys(TIMES, 0.0)
         self.round_seconds: list[float] = []
+        #: of the offline stage, which the caller measures
+        self.pretraining_seconds = 0.0
+        self._earlier_seconds, self._began = 0.0, time.perf_counter()
         self._exchange: ExchangeCallback | None = None
+
+    @property
+    def total_seconds(self) -> float:
+        """Since the callback was made, and in earlier parts of a run that was resumed."""
+        return self._earlier_seconds + time.perf_counter() - self._began
+
+    @total_seconds.setter
+    def total_seconds(self, earlier: float) -> None:
+        self._earlier_seconds, self._began = earlier, time.perf_counter()
 
     @property
     def bytes_up(self) -> int:
@@ -47,6 +63,8 @@ class CostCallback(RoundCallback):
 class DeployedCallback(RoundCallback):
     """Remembers the policies as they left local training: the exchange may replace them before the model is saved."""
 
+    state_attributes = ("_state",)
+
     def __init__(self) -> None:
         super().__init__()
         self._state: dict[str, np.ndarray] = {}
@@ -61,12 +79,35 @@ class DeployedCallback(RoundCallback):
         return {} if same else self._state
 
 
+class StopCallback(RoundCallback):
+    """Ends the training after the round in which a signal came, with a checkpoint where there are checkpoints."""
+
+    def __init__(self, signals: StopSignals, checkpoint: CheckpointCallback | None) -> None:
+        super().__init__()
+        self._signals, self._checkpoint = signals, checkpoint
+
+    def _on_training_start(self) -> None:
+        self._signals.can_wait = True
+
+    def _on_round_logged(self) -> bool:
+        if self._signals.received is None:
+            return True
+        if self._checkpoint is not None:
+            self._checkpoint.save()
+        return False
+
+    def _on_training_end(self) -> None:
+        self._signals.can_wait = False
+
+
 def _arrays(model: Any) -> dict[str, np.ndarray]:
     return {name: tensor.detach().cpu().numpy().copy() for name, tensor in model.policy.state_dict().items()}
 
 
 class RunEvalCallback(FederatedEvalCallback):
     """Keeps the average return of every evaluation, and the seconds they took."""
+
+    state_attributes = ("seconds", "curves")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

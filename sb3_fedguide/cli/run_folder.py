@@ -7,8 +7,8 @@ import json
 import os
 import platform
 import re
-import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +17,12 @@ import yaml
 if TYPE_CHECKING:
     import numpy as np
 
+#: What the federation has learned, as plain arrays: see :meth:`Federation.export_parameters`.
+PARAMETERS = "parameters.npz"
 #: Parameters of the policies before the last exchange.
 DEPLOYED = "deployed.npz"
+CHECKPOINTS = "checkpoints"
+EVALUATIONS = "evaluations.csv"
 PACKAGES = (
     "sb3-fedguide", "stable-baselines3", "gymnasium", "gymnasium-robotics", "metaworld", "mujoco", "torch", "numpy", "scipy",
     "POT", "minari", "pydantic", "tensorboard",
@@ -50,19 +54,34 @@ def create_run_folder(log_folder: Path, algo: str, family: str) -> Path:
             number += 1
 
 
+@contextmanager
+def exclusive(folder: Path) -> Iterator[None]:
+    """Nobody else writes to this run's folder meanwhile; the system takes the lock back from a process that dies.
+
+    :raises ValueError: if a process does
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows has no such locks
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f"the run in {folder} is still going on in another process") from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def write_text(path: Path, text: str) -> None:
     """The file appears complete or not at all."""
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)  # mkstemp makes files private
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    from fed_envs.files import atomic_file
+
+    with atomic_file(path) as file:
+        file.write(text)
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -75,12 +94,9 @@ def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
 
 def write_deployed(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """The policies that the clients deploy, as plain arrays beside the saved model; complete or not at all."""
-    import numpy as np
+    from sb3_fedguide.common.array_files import write_arrays
 
-    temporary = folder / f"{DEPLOYED}.part"
-    with temporary.open("wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
-    temporary.replace(folder / DEPLOYED)
+    write_arrays(folder / DEPLOYED, arrays)
 
 
 def read_deployed(folder: Path) -> dict[str, np.ndarray]:
@@ -88,17 +104,9 @@ def read_deployed(folder: Path) -> dict[str, np.ndarray]:
 
     :raises ValueError: if the file is damaged
     """
-    import zipfile
+    from sb3_fedguide.common.array_files import load_arrays
 
-    import numpy as np
-
-    if not (folder / DEPLOYED).is_file():
-        return {}
-    try:
-        with np.load(folder / DEPLOYED, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{folder / DEPLOYED} cannot be read: {error}") from None
+    return load_arrays(folder / DEPLOYED) if (folder / DEPLOYED).is_file() else {}
 
 
 def versions() -> dict[str, str]:

@@ -10,15 +10,17 @@ import re
 import types
 import typing
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 
+from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.names import check_names
 
 #: Constructor parameters that have a flag of their own or no meaning on the command line.
 NOT_HYPERPARAMETERS = {
-    "self", "policy", "env", "clients", "cache_dir", "tensorboard_log", "verbose", "seed", "device", "_init_setup_model",
+    "self", "policy", "env", "clients", "num_threads", "cache_dir", "tensorboard_log", "verbose", "seed", "device",
+    "_init_setup_model",
 }  # fmt: skip
 
 #: A value that falls linearly to zero over the run, as in rl-baselines3-zoo.
@@ -26,9 +28,12 @@ SCHEDULE = re.compile(r"^lin_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)?)$")
 
 _OPEN = 1e-12  # smallest value of what must be positive
 
-#: Closed ranges of what no constructor checks.
+#: Any integer stays below this.
+MAX_INTEGER = 2**31
+
+#: Closed ranges of what no constructor checks. Sizes end far above what is useful and below what no memory holds.
 RANGES: dict[str, tuple[float, float]] = {
-    "n_rounds": (1, math.inf),
+    "n_rounds": (1, 1e7),
     "learning_rate": (_OPEN, math.inf),
     "n_epochs": (1, math.inf),
     "gamma": (0, 1),
@@ -38,21 +43,23 @@ RANGES: dict[str, tuple[float, float]] = {
     "ent_coef": (0, math.inf),
     "vf_coef": (0, math.inf),
     "max_grad_norm": (_OPEN, math.inf),
-    "n_envs_per_client": (1, math.inf),
-    "rollout_size": (2, math.inf),
+    "n_envs_per_client": (1, 1000),
+    "rollout_size": (2, 1e7),
     "stats_window_size": (1, math.inf),
     "bc_weight": (0, 1),
     "client_fraction": (_OPEN, 1),
+    "upload_bound": (_OPEN, math.inf),
+    "trim_fraction": (0, 0.5),
     "beta": (0, 1),
-    "n_experts": (1, math.inf),
+    "n_experts": (1, 1e4),
     "eta": (_OPEN, math.inf),
-    "prior_states": (1, math.inf),
+    "prior_states": (1, 1e7),
     "density_steps": (1, math.inf),
     "sampling_steps": (1, math.inf),
     "adapt_temperature": (_OPEN, math.inf),
     "adapt_weight": (0, 1),
     "average_until": (1, math.inf),
-    "buffer_size": (1, math.inf),
+    "buffer_size": (1, 1e8),
     "learning_starts": (0, math.inf),
     "tau": (_OPEN, 1),
     "train_freq": (1, math.inf),
@@ -68,6 +75,9 @@ RANGES: dict[str, tuple[float, float]] = {
 ACTIVATIONS = {"tanh": "Tanh", "relu": "ReLU", "elu": "ELU", "leaky_relu": "LeakyReLU", "silu": "SiLU"}
 
 
+Layers = Annotated[list[Annotated[int, pydantic.Field(gt=0, le=8192)]], pydantic.Field(max_length=16)]
+
+
 class NetworkConfig(pydantic.BaseModel):
     """``policy_kwargs`` as plain data.
 
@@ -79,7 +89,7 @@ class NetworkConfig(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(extra="forbid", strict=True)
 
-    net_arch: list[pydantic.PositiveInt] | dict[Literal["pi", "vf"], list[pydantic.PositiveInt]] | None = None
+    net_arch: Layers | dict[Literal["pi", "vf"], Layers] | None = None
     activation_fn: Literal["tanh", "relu", "elu", "leaky_relu", "silu"] = "tanh"
     log_std_init: pydantic.FiniteFloat = 0.0
     ortho_init: bool = True
@@ -109,7 +119,7 @@ class DeterministicNetworkConfig(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(extra="forbid", strict=True)
 
-    net_arch: list[pydantic.PositiveInt] | dict[Literal["pi", "qf"], list[pydantic.PositiveInt]] | None = None
+    net_arch: Layers | dict[Literal["pi", "qf"], Layers] | None = None
     activation_fn: Literal["tanh", "relu", "elu", "leaky_relu", "silu"] = "relu"
 
     @pydantic.field_validator("net_arch", mode="after")
@@ -150,6 +160,11 @@ def hyperparameters(algorithm: type) -> dict[str, tuple[Any, Any]]:
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature):
             break  # the first constructor that hands nothing on states every remaining parameter
     return found
+
+
+def all_names() -> list[str]:
+    """Hyperparameters of all algorithms together, each once."""
+    return list(dict.fromkeys(name for known in ALGORITHMS for name in hyperparameters(algorithm(known))))
 
 
 def check_value(name: str, value: Any, hint: Any) -> Any:
@@ -206,12 +221,17 @@ def schedule_or_value(value: Any) -> Any:
 
 
 def _check_range(name: str, number: float) -> None:
+    if isinstance(number, int) and abs(number) >= MAX_INTEGER:
+        raise ValueError(f"{name} must be below 2^31, but it has {len(str(abs(number)))} digits")
     if not math.isfinite(number):
         raise ValueError(f"{name}={number} must be finite")
     low, high = RANGES.get(name, (-math.inf, math.inf))
     if not low <= number <= high:
         lower = "positive" if low == _OPEN else f"at least {low:g}"
-        expected = lower if high == math.inf else f"between {low:g} and {high:g}"
+        if high <= 1:
+            expected = f"between {low:g} and {high:g}"
+        else:
+            expected = lower if number < low else f"at most {high:.0f}"
         raise ValueError(f"{name}={number:g} must be {expected}")
 
 
@@ -242,4 +262,5 @@ def _describe(hint: Any) -> str:
 
 
 def _show(value: Any) -> str:
-    return f"the text {value!r}" if isinstance(value, str) else f"{value!r}"
+    shown = f"the text {value!r}" if isinstance(value, str) else f"{value!r}"
+    return shown if len(shown) <= 200 else f"{shown[:200]} ..."

@@ -9,14 +9,17 @@ import argparse
 import importlib
 import shlex
 import sys
-import time
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.names import check_names
+from sb3_fedguide.cli.resume import finished_rounds, given_flags, load_checkpoint, read_arguments, read_settings
+from sb3_fedguide.cli.run import EXIT_USAGE, Run, one_message
 
 if TYPE_CHECKING:
     from fed_envs import Family
@@ -24,7 +27,7 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
-EXIT_USAGE = 2
+EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
 ID_PREFIX, ID_SUFFIX = "fed_envs/", "-v0"
 
@@ -32,22 +35,70 @@ ID_PREFIX, ID_SUFFIX = "fed_envs/", "-v0"
 def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
     """Run the command.
 
-    :return: the exit code: 0, 2 for wrong input, 130 after an interrupt
+    :return: the exit code: 0, 1 where a file could not be written or a client broke, 2 for wrong input, 130 after an
+        interrupt (SIGINT), 143 after SIGTERM
     """
     arguments = parse_train(argv, prog)
     command = shlex.join(sys.orig_argv if argv is None else [prog, *argv])
     try:
-        import_packages(arguments.gym_packages)
-        family = find_family(arguments)
-        _check_before_imports(arguments)
-        run = prepare(arguments, family, command)
-    except ValueError as error:
-        print(f"{prog}: error: {_one_message(error)}", file=sys.stderr)
+        if arguments.resume is not None:
+            run = resume(Path(arguments.resume), given_flags(argv, prog), command, prog)
+        else:
+            import_packages(arguments.gym_packages)
+            family = find_family(arguments)
+            _check_before_imports(arguments)
+            run = prepare(arguments, family, command)
+    except (ValueError, OSError) as error:
+        print(f"{prog}: error: {one_message(error)}", file=sys.stderr)
         return EXIT_USAGE
     except KeyboardInterrupt:
         print(f"{prog}: interrupted before the run began", file=sys.stderr)
         return EXIT_INTERRUPTED
-    return run()
+    from fed_envs.faults import ClientError
+
+    try:
+        with _no_reports_of_threads():
+            return run()
+    except ClientError as error:
+        print(f"{prog}: error: {one_message(error)}; what was written before stays", file=sys.stderr)
+        return EXIT_FAILED
+    except OSError as error:  # a full disk, or a folder that is read-only
+        where = error.filename or arguments.log_folder
+        print(f"{prog}: error: {where}: {error.strerror or error}; what was written before stays", file=sys.stderr)
+        return EXIT_FAILED
+
+
+@contextmanager
+def _no_reports_of_threads() -> Iterator[None]:
+    """TensorBoard writes in a thread of its own. What fails there is raised here by its next call; once is enough."""
+    before = threading.excepthook
+    threading.excepthook = lambda failure: None if isinstance(failure.exc_value, OSError) else before(failure)
+    try:
+        yield
+    finally:
+        threading.excepthook = before
+
+
+def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Callable[[], int]:
+    """What goes on with the run in ``folder``, and holds it until then.
+
+    :param given: the flags on the command line
+    :raises ValueError: where it cannot go on
+    """
+    arguments = read_arguments(folder, given, prog)
+    import_packages(arguments.gym_packages)
+    config, family = read_settings(folder, arguments.algo)
+    from sb3_fedguide.cli.run_folder import exclusive
+
+    with ExitStack() as stack:
+        stack.enter_context(exclusive(folder))
+        if (rounds := finished_rounds(folder)) is not None:
+            print(f"the run in {folder} is finished: it had its {rounds} rounds")
+            return lambda: 0
+        run = Run(arguments, command, config, family, make_model(arguments, config, family), folder)
+        load_checkpoint(folder, run.model.resume, prog)
+        run.lock = stack.pop_all()
+    return run
 
 
 def import_packages(modules: Sequence[str]) -> None:
@@ -60,8 +111,8 @@ def import_packages(modules: Sequence[str]) -> None:
     for module in modules:
         try:
             importlib.import_module(module)
-        except ImportError as error:
-            raise ValueError(f"--gym-packages {module}: {error}") from None
+        except Exception as error:  # whatever the user's module raises while it is imported
+            raise ValueError(f"--gym-packages {module}: {type(error).__name__}: {error}") from None
 
 
 def find_family(arguments: argparse.Namespace) -> Family:
@@ -95,11 +146,13 @@ def find_family(arguments: argparse.Namespace) -> Family:
 def _check_before_imports(arguments: argparse.Namespace) -> None:
     from sb3_fedguide.cli.config import config_path, parse_params, read_config
     from sb3_fedguide.cli.run_folder import check_log_folder
+    from sb3_fedguide.offline.cache import cache_folder, check_cache_folder
 
     check_names([arguments.algo], ALGORITHMS, "algorithm")
     check_log_folder(Path(arguments.log_folder))
     if arguments.tensorboard_log is not None:
         check_log_folder(Path(arguments.tensorboard_log))
+    check_cache_folder(cache_folder(arguments.cache_dir))
     read_config(config_path(arguments.conf_file, arguments.algo))
     parse_params(arguments.hyperparams)
 
@@ -127,117 +180,6 @@ def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     return given
 
 
-class Run:
-    """A run whose inputs are all known to be sound; calling it trains."""
-
-    def __init__(
-        self,
-        arguments: argparse.Namespace,
-        command: str,
-        config: Config,
-        family: Family,
-        model: FederatedPPO | FederatedDDPG,
-    ) -> None:
-        self.arguments, self.command, self.config, self.family, self.model = arguments, command, config, family, model
-
-    def __call__(self) -> int:
-        from sb3_fedguide.cli.report import print_summary
-        from sb3_fedguide.cli.run_folder import create_run_folder, write_deployed, write_json
-
-        arguments, model = self.arguments, self.model
-        folder = create_run_folder(Path(arguments.log_folder), arguments.algo, self.family.name)
-        self._record_inputs(folder)
-        self._set_logger(folder)
-        if arguments.verbose:
-            print(f"{arguments.algo} on {self.family.name}: {model.n_clients} clients, {self.config.n_rounds} rounds, "
-                  f"writing to {folder}", flush=True)  # fmt: skip
-        exit_code = 0
-        try:
-            summary = self._train(folder)
-        except KeyboardInterrupt:
-            print(f"\ninterrupted in round {model.round + 1}; what there is stays in {folder}", file=sys.stderr)
-            summary, exit_code = self._summary(), EXIT_INTERRUPTED
-        except OfflineStageError as error:
-            print(f"error in the offline stage: {_one_message(error)}", file=sys.stderr)
-            return EXIT_USAGE
-        finally:
-            model.logger.close()
-        if model.round > 0:
-            model.save(folder / "model.zip")
-            if deployed := self._deployed.replaced():
-                write_deployed(folder, deployed)
-        write_json(folder / "summary.json", summary)
-        if arguments.verbose:
-            print_summary(summary, str(folder))
-        return exit_code
-
-    def _record_inputs(self, folder: Path) -> None:
-        from sb3_fedguide.cli.run_folder import versions, write_json, write_text, write_yaml
-
-        write_yaml(folder / "config.yml", self.config.values)
-        write_yaml(folder / "args.yml", {**vars(self.arguments), "seed": self.model.seed})
-        write_text(folder / "command.txt", self.command + "\n")
-        write_json(folder / "versions.json", versions())
-        self.family.dump(folder / "metadata.json")
-        write_text(folder / "metadata.sha256", self.family.content_hash + "\n")
-
-    def _set_logger(self, folder: Path) -> None:
-        from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
-
-        arguments = self.arguments
-        events = folder / "tb"
-        if arguments.tensorboard_log is not None:
-            number = folder.name.rsplit("_", 1)[1]
-            events = Path(arguments.tensorboard_log) / self.family.name / f"{arguments.algo}_{number}"
-        loud = arguments.verbose == 2 or (arguments.verbose == 1 and not arguments.progress)
-        outputs: list[KVWriter] = [TensorBoardOutputFormat(str(events))]
-        if loud:
-            outputs.append(HumanOutputFormat(sys.stdout))
-        self.model.set_logger(Logger(str(events), outputs))
-
-    def _train(self, folder: Path) -> dict[str, Any]:
-        from sb3_fedguide.cli.recorder import CostCallback, DeployedCallback, RunEvalCallback
-
-        arguments, model = self.arguments, self.model
-        self._started, self._pretraining_seconds = time.perf_counter(), 0.0
-        self._costs, self._deployed, self._evaluation = CostCallback(), DeployedCallback(), None
-        if not arguments.no_eval:
-            self._evaluation = RunEvalCallback(
-                self.config.n_rounds, arguments.eval_freq, arguments.eval_episodes, folder / "evaluations.csv"
-            )
-        try:
-            model.pretrain(progress_bar=arguments.progress)
-        except ValueError as error:
-            raise OfflineStageError(str(error)) from error
-        self._pretraining_seconds = time.perf_counter() - self._started
-        model.learn(
-            self.config.n_rounds * model.rollout_size * model.n_participants,
-            [callback for callback in (self._evaluation, self._costs, self._deployed) if callback is not None],
-            progress_bar=arguments.progress,
-        )
-        return self._summary()
-
-    def _summary(self) -> dict[str, Any]:
-        from sb3_fedguide.cli.report import summarize
-
-        return summarize(
-            self.model,
-            self._costs,
-            self._evaluation,
-            self._pretraining_seconds,
-            time.perf_counter() - self._started,
-            algo=self.arguments.algo,
-            env=self.family.name,
-            conf_file=self.arguments.conf_file,
-            metadata_hash=self.family.content_hash,
-            n_rounds=self.config.n_rounds,
-        )
-
-
-class OfflineStageError(Exception):
-    """Something in the offline stage that the user can put right, such as a dataset that cannot be read."""
-
-
 def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
     """Resolve the hyperparameters and construct the algorithm; nothing is written yet.
 
@@ -250,19 +192,26 @@ def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
     config = resolve(arguments.algo, family, arguments.conf_file, entry, given, arguments.n_timesteps)
     if config.values["pretraining"]["dataset"] is not None:
         _check_dataset(config.values["pretraining"]["dataset"], family)
+    return Run(arguments, command, config, family, make_model(arguments, config, family))
 
+
+def make_model(arguments: argparse.Namespace, config: Config, family: Family) -> FederatedPPO | FederatedDDPG:
+    """Construct the algorithm.
+
+    :raises ValueError: where the settings do not fit together
+    """
     import torch as th
 
     _check_device(arguments.device)
-    th.set_num_threads(arguments.num_threads)
-    model = config.make(
+    th.set_num_threads(1)
+    return config.make(
         family,
         seed=arguments.seed if arguments.seed >= 0 else None,
         device=arguments.device,
+        num_threads=arguments.num_threads,
         cache_dir=arguments.cache_dir,
         verbose=0,
     )
-    return Run(arguments, command, config, family, model)
 
 
 def _check_dataset(dataset: str, family: Family) -> None:
@@ -286,7 +235,3 @@ def _check_device(device: str) -> None:
     available = {"cpu": True, "cuda": th.cuda.is_available(), "mps": th.backends.mps.is_available()}
     if not available.get(kind, False):
         raise ValueError(f"device {device!r} is not available on this machine; use --device cpu")
-
-
-def _one_message(error: Exception) -> str:
-    return "\n  ".join(str(error).splitlines())

@@ -21,9 +21,11 @@ class FederationArguments(TypedDict, total=False):
     gamma: float
     n_envs_per_client: int
     clients: Sequence[int] | None
+    num_threads: int
     normalize: bool
     bc_weight: float
     client_fraction: float
+    upload_bound: float | None
     pretraining: PretrainingConfig | dict[str, Any] | None
     cache_dir: str | Path | None
     stats_window_size: int

@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 from tqdm import tqdm
+
+from fed_envs.state import State, declared_state, load_declared
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
 
 
 class RoundCallback(BaseCallback):
-    """A callback with three more events: before a round, after local training, and after the exchange that ends the round.
+    """A callback with four more events: before a round, after local training, after the exchange, after the round's log.
 
     Between the two, a method that shares its policy replaces the clients' own parameters: what a client would deploy is
-    seen in :meth:`_on_training_step_end`, what the server broadcast in :meth:`_on_round_end`.
+    seen in :meth:`_on_local_training_end`, what the server broadcast in :meth:`_on_round_end`.
     """
 
     model: Federation  # type: ignore[assignment]
+    #: attributes that a checkpoint holds; those of base classes are added
+    state_attributes: ClassVar[tuple[str, ...]] = ()
+
+    def save_state(self) -> State:
+        """What a checkpoint has to know of this callback, as plain data."""
+        return declared_state(self)
+
+    def load_state(self, state: State) -> None:
+        """Go on from what :meth:`save_state` returned, before the training starts."""
+        load_declared(self, state)
 
     def _on_step(self) -> bool:
         return True
@@ -35,6 +48,9 @@ class RoundCallback(BaseCallback):
     def on_round_end(self) -> None:
         self._on_round_end()
 
+    def on_round_logged(self) -> bool:
+        return self._on_round_logged()
+
     def _on_round_start(self) -> None:
         """Before the rollout; who takes part is known."""
 
@@ -43,6 +59,10 @@ class RoundCallback(BaseCallback):
 
     def _on_round_end(self) -> None:
         """After the exchange, before the round's log is written."""
+
+    def _on_round_logged(self) -> bool:
+        """After everything that belongs to the round; false ends the training."""
+        return True
 
 
 def round_callbacks(callback: BaseCallback | None) -> Iterator[RoundCallback]:
@@ -62,6 +82,8 @@ class ExchangeCallback(RoundCallback):
     A deployment over a network replaces this callback by its transport; clients and strategy stay the same.
     """
 
+    state_attributes = ("bytes_up", "bytes_down")
+
     def __init__(self) -> None:
         super().__init__()
         self.bytes_up = 0
@@ -77,7 +99,7 @@ class ExchangeCallback(RoundCallback):
     def _on_round_start(self) -> None:
         model = self.model
         for index in np.flatnonzero(model.present & model.outdated).tolist():
-            broadcast = model.strategy.latest(model.client_ids[index]) if model.strategy is not None else {}
+            broadcast = model.strategy.catch_up(model.client_ids[index]) if model.strategy is not None else {}
             model.receive(index, broadcast)
             model.outdated[index] = False
             self.bytes_down += payload_bytes({index: broadcast})
@@ -92,10 +114,15 @@ class ExchangeCallback(RoundCallback):
         started = time.perf_counter()
         present = {client: index for index, client in enumerate(model.client_ids) if model.present[index]}
         uploads = {client: model.upload(index) for client, index in present.items()}
-        broadcasts = strategy.aggregate(model.round, uploads)
-        for client, index in present.items():
-            model.receive(index, broadcasts[client])
+        broadcasts = strategy.exchange(model.round, uploads)
+        for client, broadcast in broadcasts.items():
+            model.receive(present[client], broadcast)
+        for client, reason in strategy.rejected.items():
+            warnings.warn(f"round {model.round}: the server rejects the upload of client {client}: {reason}", stacklevel=1)
+            model.record_client(client, "rejected", 1.0)
         model.outdated |= ~model.present
+        if any(broadcasts.values()):  # what the others received is what a rejected one has missed
+            model.outdated[[present[client] for client in strategy.rejected]] = True
         up, down = payload_bytes(uploads), payload_bytes(broadcasts)
         self.bytes_up += up
         self.bytes_down += down

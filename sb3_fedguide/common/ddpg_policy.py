@@ -8,7 +8,6 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
-from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
@@ -100,8 +99,8 @@ class StackedDDPGPolicy(StackedPolicy, TD3Policy):
             module.requires_grad_(False)
         # Kept, because to walk through the modules takes as long as some of what is computed with them.
         self.actor_parameters = list(self.actor.parameters())
-        self._networks = [*self.actor.parameters(), *self.critic.parameters()]
-        self._targets = [*self.actor_target.parameters(), *self.critic_target.parameters()]
+        self._networks: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
+        self._targets: list[th.Tensor] = [*self.actor_target.parameters(), *self.critic_target.parameters()]
 
     def actions(self, obs: th.Tensor) -> th.Tensor:
         """``(n_clients, batch, obs_dim)`` to actions in [-1, 1], ``(n_clients, batch, action_dim)``."""
@@ -126,7 +125,8 @@ class StackedDDPGPolicy(StackedPolicy, TD3Policy):
         :param clients: positions of the clients whose targets move; all if ``None``
         """
         if clients is None:
-            polyak_update(self._networks, self._targets, tau)
+            th._foreach_mul_(self._targets, 1 - tau)  # SB3's polyak_update, bit for bit, in two calls
+            th._foreach_add_(self._targets, self._networks, alpha=tau)
             return
         for network, target in zip(self._networks, self._targets, strict=True):
             target[clients] = (1 - tau) * target[clients] + tau * network[clients]

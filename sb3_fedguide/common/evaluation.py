@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fed_envs import FederatedVecEnv
+from fed_envs.state import State, freeze, thaw
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.seeding import EVALUATION_SEED, Role
 
@@ -89,8 +90,8 @@ def evaluate_federation(
 class FederatedEvalCallback(RoundCallback):
     """Evaluates the deployed policies every ``eval_freq`` rounds and in each of the last twenty, and writes a CSV.
 
-    The deployed policy is a client's own after local training. Methods that share a policy report the broadcast one as
-    well, every ``eval_freq`` rounds and after the last.
+    The deployed policy is a client's own after local training. Where the exchange of an evaluated round replaces the
+    policies, the broadcast one is evaluated as well, every ``eval_freq`` rounds and after the last.
 
     :param n_rounds: rounds of the whole run
     :param eval_freq: rounds between evaluations
@@ -117,6 +118,29 @@ class FederatedEvalCallback(RoundCallback):
         #: the last evaluation of the deployed and of the broadcast policy
         self.last: dict[str, Evaluation] = {}
 
+    def save_state(self) -> State:
+        evaluations = {policy: freeze(vars(evaluation)) for policy, evaluation in self.last.items()}
+        written = self.csv_path is not None and self.csv_path.exists()
+        size = self.csv_path.stat().st_size if written else None  # type: ignore[union-attr]
+        return {**super().save_state(), "evaluations": evaluations, "csv_size": size}
+
+    def load_state(self, state: State) -> None:
+        """Rows that were written after the state was taken are cut off: they will be written again.
+
+        :raises ValueError: where rows are missing that the state counts on
+        """
+        super().load_state({name: state[name] for name in state.keys() - {"evaluations", "csv_size"}})
+        self.last = {policy: Evaluation(**thaw(values)) for policy, values in state["evaluations"].items()}
+        if self.csv_path is None or state["csv_size"] is None:
+            return
+        size = self.csv_path.stat().st_size if self.csv_path.exists() else 0
+        if size < state["csv_size"]:
+            raise ValueError(
+                f"{self.csv_path} has {size} bytes and had {state['csv_size']} when the checkpoint was written: rows are "
+                "missing"
+            )
+        os.truncate(self.csv_path, state["csv_size"])
+
     def _on_training_start(self) -> None:
         self.env = evaluation_env(self.model, self.n_episodes)
         if self.csv_path is not None and not self.csv_path.exists():
@@ -124,9 +148,13 @@ class FederatedEvalCallback(RoundCallback):
             with self.csv_path.open("w", newline="") as file:
                 csv.writer(file).writerow(header)
 
+    def is_due(self, round: int) -> bool:
+        """Whether the deployed policies are evaluated after the local training of round ``round``, counted from 1."""
+        return round % self.eval_freq == 0 or round > self.n_rounds - self.LAST_ROUNDS
+
     def _on_local_training_end(self) -> None:
         round = self.model.round + 1
-        if round % self.eval_freq == 0 or round > self.n_rounds - self.LAST_ROUNDS:
+        if self.is_due(round):
             evaluation = self._evaluate("deployed", round)
             self.logger.record("eval/mean_reward", evaluation.average)
             self.logger.record("eval/worst_client", evaluation.worst_client)
@@ -140,14 +168,22 @@ class FederatedEvalCallback(RoundCallback):
 
     def _on_round_end(self) -> None:
         round = self.model.round
-        if self.model.shares_policy and (round % self.eval_freq == 0 or round == self.n_rounds):
-            self.logger.record("eval/broadcast_mean_reward", self._evaluate("broadcast", round).average)
+        if not self.model.sends_policy(round):
+            self.last.pop("broadcast", None)  # nobody has that policy any more
+        elif round % self.eval_freq == 0 or round == self.n_rounds:
+            evaluation = self._evaluate("broadcast", round)
+            self.logger.record("eval/broadcast_mean_reward", evaluation.average)
+            self.logger.record("eval/averaging_change", evaluation.average - self.last["deployed"].average)
 
     def _on_training_end(self) -> None:
         self.env.close()
 
+    def run(self) -> Evaluation:
+        """The model's current policies in this callback's episodes; nothing is logged or written."""
+        return evaluate_federation(lambda obs: self.model.predict(obs, deterministic=self.deterministic)[0], self.env)
+
     def _evaluate(self, policy: str, round: int) -> Evaluation:
-        evaluation = evaluate_federation(lambda obs: self.model.predict(obs, deterministic=self.deterministic)[0], self.env)
+        evaluation = self.run()
         self.last[policy] = evaluation
         if self.csv_path is not None:
             with self.csv_path.open("a", newline="") as file:

@@ -17,8 +17,10 @@ from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from fed_envs import FederatedVecEnv
+from fed_envs.state import State
 from sb3_fedguide.common.ddpg_policy import BoundedActor, StackedDDPGPolicy
 from sb3_fedguide.common.export import client_ddpg, export_program
+from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation, FederationLike, as_federated_env
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
 from sb3_fedguide.common.normalization import FederatedNormalizer
@@ -27,6 +29,7 @@ from sb3_fedguide.common.replay_buffer import FederatedReplayBuffer
 from sb3_fedguide.common.seeding import Role, integer_seed
 from sb3_fedguide.common.training_log import RoundStatistics
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
+from sb3_fedguide.server.validation import UPLOAD_BOUND
 
 
 class FederatedDDPG(Federation, DDPG):
@@ -57,9 +60,11 @@ class FederatedDDPG(Federation, DDPG):
     :param noise_dt: its time step; 1 in the paper, 0.01 in SB3
     :param n_envs_per_client: environments per client; must divide ``rollout_size``
     :param clients: ids of the clients that live here; all by default
+    :param num_threads: at most so many threads step the simulators, see :class:`fed_envs.FederatedVecEnv`
     :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client
     :param bc_weight: alpha of ``theta_0 = (1 - alpha) theta_rand + alpha theta_BC`` for the actor (paper: 0.3)
     :param client_fraction: share of the clients that take part in each round, as for :class:`FederatedPPO`
+    :param upload_bound: as for :class:`FederatedPPO`
     :param pretraining: settings of the offline stage, a ``PretrainingConfig`` or a dict of its fields
     :param cache_dir: where the offline stage keeps its results; by default the user's cache folder
     :param stats_window_size: finished episodes per client over which returns are averaged
@@ -72,6 +77,7 @@ class FederatedDDPG(Federation, DDPG):
     replay_buffer: FederatedReplayBuffer | None  # type: ignore[assignment]
     policy: StackedDDPGPolicy
     train_freq: int
+    state_attributes = ("client_steps",)
 
     def __init__(
         self,
@@ -91,9 +97,11 @@ class FederatedDDPG(Federation, DDPG):
         noise_dt: float = 1.0,
         n_envs_per_client: int = 1,
         clients: Sequence[int] | None = None,
+        num_threads: int = 1,
         normalize: bool = False,
         bc_weight: float = 0.0,
         client_fraction: float = 1.0,
+        upload_bound: float | None = UPLOAD_BOUND,
         pretraining: PretrainingConfig | dict[str, Any] | None = None,
         cache_dir: str | Path | None = None,
         stats_window_size: int = 100,
@@ -104,8 +112,8 @@ class FederatedDDPG(Federation, DDPG):
         device: th.device | str = "cpu",
         _init_setup_model: bool = True,
     ) -> None:
-        env = as_federated_env(env, n_envs_per_client, clients)
-        self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction)
+        env = as_federated_env(env, n_envs_per_client, clients, num_threads)
+        self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
         self.rollout_size = rollout_size
         self.noise_theta, self.noise_sigma, self.noise_dt = noise_theta, noise_sigma, noise_dt
         #: steps that each client has taken in its life, ``(n_clients,)``
@@ -161,8 +169,7 @@ class FederatedDDPG(Federation, DDPG):
             norm_obs=self.normalize,
             norm_reward=self.normalize,
         )
-        if self.strategy is None:
-            self.strategy = self._make_strategy()
+        self._start_server()
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         return [self.actor.optimizer, self.critic.optimizer]
@@ -184,6 +191,7 @@ class FederatedDDPG(Federation, DDPG):
         self._statistics, self._training_seconds = RoundStatistics(), 0.0
         if not self.collect_rollouts(self.env, callbacks, self.rollout_size // self.n_envs_per_client):  # type: ignore
             return False
+        self._check_experience()
         self.logger.record("time/rollout", time.perf_counter() - started - self._training_seconds)
         self.logger.record("time/train", self._training_seconds)
         self._record_training()
@@ -299,6 +307,13 @@ class FederatedDDPG(Federation, DDPG):
             self.policy.update_targets(self.tau, learners)
             self._statistics.add(critic_loss=critic_loss * counted, actor_loss=actor_loss * counted, updates=counted)
 
+    def _check_experience(self) -> None:
+        assert self.replay_buffer is not None
+        count = min(self.rollout_size, self.buffer_size)
+        recent = (self.replay_buffer.positions + np.arange(-count, 0)[:, None]) % self.buffer_size, np.arange(self.n_clients)
+        names = {"an observation": "next_observations", "a reward": "rewards"}
+        check_experience(self.client_ids, {name: getattr(self.replay_buffer, array)[recent] for name, array in names.items()})
+
     def _record_training(self) -> None:
         means = self._statistics.means()
         share = means.pop("updates", np.zeros(self.n_clients))
@@ -323,6 +338,16 @@ class FederatedDDPG(Federation, DDPG):
         actor: Any = self.client(client_id).policy.actor
         policy = nn.Sequential(actor.features_extractor, BoundedActor(actor.mu, self.action_space))  # type: ignore[arg-type]
         export_program(policy, self.observation_space.shape[0], path)  # type: ignore[index]
+
+    def save_state(self) -> State:
+        assert self.replay_buffer is not None
+        return {**super().save_state(), "noise": self.noise.state.copy(), "replay_buffer": self.replay_buffer.save_state()}
+
+    def load_state(self, state: State) -> None:
+        assert self.replay_buffer is not None
+        super().load_state(state)
+        self.noise.state = state["noise"].copy()
+        self.replay_buffer.load_state(state["replay_buffer"])
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_statistics"]

@@ -18,6 +18,7 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide.common import gaussian
+from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation, FederationLike, PolicyLike, as_federated_env
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.participation import ParticipationAdam
@@ -27,6 +28,7 @@ from sb3_fedguide.common.seeding import Role, integer_seed
 from sb3_fedguide.common.stacked import clip_grad_norm_per_client
 from sb3_fedguide.common.training_log import RoundStatistics, record_training
 from sb3_fedguide.offline.pretraining import PretrainingConfig
+from sb3_fedguide.server.validation import UPLOAD_BOUND
 
 
 class FederatedPPO(Federation, PPO):
@@ -51,10 +53,13 @@ class FederatedPPO(Federation, PPO):
     :param max_grad_norm: bound on each client's own gradient norm
     :param n_envs_per_client: environments per client; must divide ``rollout_size``
     :param clients: ids of the clients that live here; all by default
+    :param num_threads: at most so many threads step the simulators, see :class:`fed_envs.FederatedVecEnv`
     :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client
     :param bc_weight: alpha of ``theta_0 = (1 - alpha) theta_rand + alpha theta_BC`` for the actor (paper: 0.3)
     :param client_fraction: share of the clients that take part in each round, drawn by the server; the others keep all of
         their state, and receive what they missed before they train again
+    :param upload_bound: how far norms of uploads may exceed the clients' median before the server rejects them, see
+        :func:`~sb3_fedguide.server.validation.check_uploads`; ``None`` leaves out all checks of uploads
     :param pretraining: settings of the offline stage, a ``PretrainingConfig`` or a dict of its fields
     :param cache_dir: where the offline stage keeps its results; by default the user's cache folder
     :param stats_window_size: finished episodes per client over which returns are averaged
@@ -85,9 +90,11 @@ class FederatedPPO(Federation, PPO):
         max_grad_norm: float = 0.5,
         n_envs_per_client: int = 1,
         clients: Sequence[int] | None = None,
+        num_threads: int = 1,
         normalize: bool = False,
         bc_weight: float = 0.0,
         client_fraction: float = 1.0,
+        upload_bound: float | None = UPLOAD_BOUND,
         pretraining: PretrainingConfig | dict[str, Any] | None = None,
         cache_dir: str | Path | None = None,
         stats_window_size: int = 100,
@@ -98,8 +105,8 @@ class FederatedPPO(Federation, PPO):
         device: th.device | str = "cpu",
         _init_setup_model: bool = True,
     ) -> None:
-        env = as_federated_env(env, n_envs_per_client, clients)
-        self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction)
+        env = as_federated_env(env, n_envs_per_client, clients, num_threads)
+        self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
         check_sizes(rollout_size, batch_size, self.n_envs_per_client)
         self.rollout_size = rollout_size
         with warnings.catch_warnings():
@@ -156,8 +163,7 @@ class FederatedPPO(Federation, PPO):
             norm_obs=self.normalize,
             norm_reward=self.normalize,
         )
-        if self.strategy is None:
-            self.strategy = self._make_strategy()
+        self._start_server()
 
     def _prepare_training(self) -> None:
         """After the rollout, before the first minibatch: compute what the extra losses need, once per round."""
@@ -198,6 +204,7 @@ class FederatedPPO(Federation, PPO):
         shape = (self.n_clients, self.n_envs_per_client)
         low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
         noise = self._exploration_noise(n_rollout_steps)
+        actor_mean = self.policy.fixed_actor_mean()
         n_active = int(env.active.sum())
         raw_obs = self._last_obs.reshape(*shape, -1)  # type: ignore[union-attr]
         obs = self.normalizer.normalize_obs(raw_obs)
@@ -205,10 +212,9 @@ class FederatedPPO(Federation, PPO):
         present = None if self.present.all() else self.present
         dones = starts
         for step in range(n_rollout_steps):
-            with th.no_grad():
-                mean = self.policy.actor_mean(th.as_tensor(obs, device=self.device)).cpu().numpy()
+            mean = actor_mean(th.as_tensor(obs, device=self.device)).cpu().numpy()
             actions = mean + noise[step]
-            flat_actions = np.clip(actions, low, high).reshape(env.num_envs, -1)
+            flat_actions = np.minimum(np.maximum(actions, low), high).reshape(env.num_envs, -1)  # np.clip is slower
             new_raw_obs, raw_rewards, flat_dones, infos = env.step(flat_actions)
             self.num_timesteps += n_active
             callback.update_locals(locals())
@@ -247,9 +253,25 @@ class FederatedPPO(Federation, PPO):
             final = np.asarray(info["terminal_observation"])
             self.rollout_buffer.add_truncation(client, env, final, self.normalizer.normalize_obs(final, client))
 
+    def _check_experience(self) -> None:
+        buffer = self.rollout_buffer
+        finals = np.zeros((buffer.pos, self.n_clients), dtype=bool)  # of episodes that were cut off, and of the rollout
+        for step, client, _, final, _ in buffer.truncations:
+            finals[step, client] |= not np.isfinite(final).all()
+        finals[-1:] |= ~np.isfinite(self._last_obs).reshape(self.n_clients, -1).all(axis=1)  # type: ignore[arg-type]
+        check_experience(
+            self.client_ids,
+            {
+                "an observation": buffer.raw_observations[: buffer.pos],
+                "a reward": buffer.rewards[: buffer.pos],
+                "a final observation": np.where(finals, np.nan, 0.0),
+            },
+        )
+
     @th.no_grad()
     def _finish_rollout(self, raw_obs: np.ndarray, obs: np.ndarray, dones: np.ndarray) -> None:
         """Values, log-probabilities and advantages of the whole rollout."""
+        self._check_experience()
         buffer = self.rollout_buffer
         rows = th.as_tensor(buffer.rows(buffer.observations), device=self.device)
         actions = th.as_tensor(buffer.rows(buffer.actions), device=self.device)

@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -21,22 +21,27 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from fed_envs import FederatedVecEnv
-from sb3_fedguide.common.callbacks import ExchangeCallback, RoundProgressCallback, round_callbacks
+from fed_envs.faults import ClientError
+from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback, RoundProgressCallback, round_callbacks
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
 from sb3_fedguide.common.export import client_model, export_client
+from sb3_fedguide.common.faults import check_policies, in_round
 from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.parameters import ParameterFiles
 from sb3_fedguide.common.participation import draw_participants, n_participants
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
+from sb3_fedguide.common.resumable import Resumable
 from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
 from sb3_fedguide.server.strategy import Payload, Strategy
+from sb3_fedguide.server.validation import UPLOAD_BOUND, check_bound
 
 PolicyLike = str | type[ActorCriticPolicy]
 FederationLike = str | Path | Any | Sequence[Callable[[], gym.Env]]
 SelfFederation = TypeVar("SelfFederation", bound="Federation")
 
 
-class Federation(BaseAlgorithm):
+class Federation(ParameterFiles, Resumable):
     """Mixin for SB3 algorithms that train all clients of a family in lockstep.
 
     A method defines the server's side with :meth:`_make_strategy`, the client's with :meth:`upload` and :meth:`receive`,
@@ -47,8 +52,6 @@ class Federation(BaseAlgorithm):
     normalizer: FederatedNormalizer
     rollout_size: int
     gamma: float
-    #: whether the broadcast policy differs from the deployed one and deserves an evaluation of its own
-    shares_policy: ClassVar[bool] = False
 
     def _init_federation(
         self,
@@ -58,6 +61,7 @@ class Federation(BaseAlgorithm):
         pretraining: PretrainingConfig | dict[str, Any] | None,
         cache_dir: str | Path | None,
         client_fraction: float = 1.0,
+        upload_bound: float | None = UPLOAD_BOUND,
     ) -> None:
         """Called by a subclass's constructor, before SB3's."""
         if not 0.0 < client_fraction <= 1.0:
@@ -72,6 +76,8 @@ class Federation(BaseAlgorithm):
         self.pretraining_config = PretrainingConfig.model_validate(pretraining or {})
         self.cache_dir = cache_dir
         self.client_fraction = client_fraction
+        check_bound(upload_bound)
+        self.upload_bound = upload_bound
         #: who takes part in the current round, ``(n_clients,)`` bool
         self.present = np.ones(self.n_clients, dtype=bool)
         #: who missed the last exchange and receives what the server last sent before training again
@@ -127,6 +133,17 @@ class Federation(BaseAlgorithm):
             assert self.seed is not None
             self._streams[role] = [stream(self.seed, role, client) for client in self.client_ids]
         return self._streams[role]
+
+    def sends_policy(self, round: int) -> bool:
+        """Whether the exchange after round ``round`` replaces the clients' policies; what it sent is evaluated as well."""
+        return False
+
+    def _start_server(self) -> None:
+        """Make the server's side, unless it came with a saved model."""
+        if self.strategy is None:
+            self.strategy = self._make_strategy()
+            if self.strategy is not None:
+                self.strategy.upload_bound = self.upload_bound
 
     def _make_strategy(self) -> Strategy | None:
         """The server's side of this method; ``None`` where nothing is exchanged."""
@@ -197,32 +214,50 @@ class Federation(BaseAlgorithm):
         self.pretrain(progress_bar)
         reset = reset_num_timesteps or self._last_obs is None
         # SB3 offers no event after train(), and off policy it knows no rounds, so the loop is our own: train, exchange, log.
-        total_timesteps, callbacks = self._setup_learn(
-            total_timesteps,
-            self._round_callbacks(callback, total_timesteps, progress_bar),
-            reset_num_timesteps,
-            tb_log_name or type(self).__name__,
-        )
+        with in_round(1 if reset_num_timesteps else self.round + 1):
+            total_timesteps, callbacks = self._setup_learn(
+                total_timesteps,
+                self._round_callbacks(callback, total_timesteps, progress_bar),
+                reset_num_timesteps,
+                tb_log_name or type(self).__name__,
+            )
         if reset_num_timesteps:
             self.round = 0
         self._begin_learning(environments_were_reset=reset)
         rounds = list(round_callbacks(callbacks))
+        self._resume_callbacks(rounds)
         callbacks.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
-            self._draw_participants()
-            for hook in rounds:
-                hook.on_round_start()
-            if not self._train_round(callbacks):
-                break
-            for hook in rounds:
-                hook.on_local_training_end()
-            self.round += 1
-            for hook in rounds:
-                hook.on_round_end()
-            if log_interval is not None and self.round % log_interval == 0:
-                self.dump_logs(self.round)
+            with in_round(self.round + 1):
+                if not self._play_round(callbacks, rounds, log_interval):
+                    break
         callbacks.on_training_end()
         return self
+
+    def _play_round(self, callbacks: BaseCallback, rounds: list[RoundCallback], log_interval: int | None) -> bool:
+        """Train, exchange, log; false where a callback ended the training."""
+        self._draw_participants()
+        for hook in rounds:
+            hook.on_round_start()
+        try:
+            if not self._train_round(callbacks):
+                return False
+        except ClientError:
+            self._check_experience()  # what an environment returned explains an action that is not finite
+            raise
+        check_policies(self.client_ids, self.policy)
+        for hook in rounds:
+            hook.on_local_training_end()
+        self.round += 1
+        for hook in rounds:
+            hook.on_round_end()
+        if log_interval is not None and self.round % log_interval == 0:
+            self.dump_logs(self.round)
+        return all([hook.on_round_logged() for hook in rounds])
+
+    @abstractmethod
+    def _check_experience(self) -> None:
+        """:raises ClientError: where an environment returned what is not finite in this round"""
 
     @abstractmethod
     def _train_round(self, callbacks: BaseCallback) -> bool:
@@ -242,9 +277,10 @@ class Federation(BaseAlgorithm):
         if environments_were_reset:
             self.normalizer.reset_returns()
             self.normalizer.update_obs(self._last_obs.reshape(self.n_clients, self.n_envs_per_client, -1))  # type: ignore
-        self.episode_infos: list[deque[dict[str, float]]] = [
-            deque(maxlen=self._stats_window_size) for _ in range(self.n_clients)
-        ]
+        if environments_were_reset or not hasattr(self, "episode_infos"):
+            self.episode_infos: list[deque[dict[str, float]]] = [
+                deque(maxlen=self._stats_window_size) for _ in range(self.n_clients)
+            ]
 
     def mean_episode_return(self) -> float:
         """Average over clients of each one's mean return over its last finished training episodes."""
@@ -321,7 +357,10 @@ class Federation(BaseAlgorithm):
 
 
 def as_federated_env(
-    env: FederationLike | None, n_envs_per_client: int = 1, clients: Sequence[int] | None = None
+    env: FederationLike | None,
+    n_envs_per_client: int = 1,
+    clients: Sequence[int] | None = None,
+    num_threads: int = 1,
 ) -> FederatedVecEnv | None:
     """A ``FederatedVecEnv`` from a family name, metadata file, ``Family`` or list of factories.
 
@@ -334,4 +373,4 @@ def as_federated_env(
             f"a federation needs one environment per client, but got a single {type(env).__name__}; pass a family name, "
             "a metadata file, a fed_envs.FederatedVecEnv or a list of environment factories"
         )
-    return FederatedVecEnv(env, n_envs_per_client=n_envs_per_client, clients=clients)
+    return FederatedVecEnv(env, n_envs_per_client=n_envs_per_client, clients=clients, num_threads=num_threads)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
 from sb3_fedguide.common.federation import Federation
-from sb3_fedguide.server.averaging import Averaging
+from sb3_fedguide.server.averaging import Averaging, averaging_is_due, check_aggregator
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload, Strategy
 
 AVERAGE_CHOICES = ("all", "actor", "critic")
@@ -16,16 +16,22 @@ AVERAGE_CHOICES = ("all", "actor", "critic")
 class ParameterAveraging(Federation):
     """Mixin for methods that average policy parameters; optimiser state and normalisation stay with their client."""
 
-    shares_policy: ClassVar[bool] = True
-
     def _init_averaging(
-        self, average: Literal["all", "actor", "critic"], average_every: int, average_until: int | None
+        self,
+        average: Literal["all", "actor", "critic"],
+        average_every: int,
+        average_until: int | None,
+        aggregator: Literal["mean", "median", "trimmed_mean"],
+        trim_fraction: float,
     ) -> None:
         """Called by a subclass's constructor, before its base's."""
         if average not in AVERAGE_CHOICES:
             raise ValueError(f"average={average!r} must be one of {', '.join(AVERAGE_CHOICES)}")
         if average_every < 1:
             raise ValueError(f"average_every={average_every} must be at least 1 round")
+        check_aggregator(aggregator, trim_fraction)
+        self.aggregator: Literal["mean", "median", "trimmed_mean"] = aggregator
+        self.trim_fraction = trim_fraction
         self.average: Literal["all", "actor", "critic"] = average
         self.average_every = average_every
         self.average_until = average_until
@@ -36,8 +42,11 @@ class ParameterAveraging(Federation):
         actor, critic = self.policy.actor_prefixes, self.policy.critic_prefixes
         return {"all": actor + critic, "actor": actor, "critic": critic}[self.average]
 
+    def sends_policy(self, round: int) -> bool:
+        return self.average != "critic" and averaging_is_due(round, self.average_every, self.average_until)
+
     def _make_strategy(self) -> Strategy:
-        return Averaging(self.averaged_prefixes, self.average_every, self.average_until)
+        return Averaging(self.averaged_prefixes, self.average_every, self.average_until, self.aggregator, self.trim_fraction)
 
     def upload(self, index: int) -> Payload:
         return policy_upload(self, index, self.averaged_prefixes)

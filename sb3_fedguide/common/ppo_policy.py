@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from typing import Any
 
 import torch as th
@@ -13,7 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_fedguide.common import gaussian
-from sb3_fedguide.common.stacked import stack_tensor
+from sb3_fedguide.common.stacked import fixed_forward, stack_tensor
 from sb3_fedguide.common.stacked_policy import StackedPolicy, check_spaces
 
 ACTOR_PREFIXES = ("mlp_extractor.policy_net.", "action_net.", "log_std")
@@ -103,6 +104,10 @@ class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
     def actor_mean(self, obs: th.Tensor) -> th.Tensor:
         """Mean of the Gaussian policy; ``obs`` ``(n_clients, batch, obs_dim)`` to ``(n_clients, batch, action_dim)``."""
         return self.action_net(self.mlp_extractor.policy_net(obs))
+
+    def fixed_actor_mean(self) -> Callable[[th.Tensor], th.Tensor]:
+        """:meth:`actor_mean` with the present weights, without gradients: for a rollout, which calls it at every step."""
+        return fixed_forward([self.mlp_extractor.policy_net, self.action_net])
 
     def values(self, obs: th.Tensor) -> th.Tensor:
         """The critics' values, ``(n_clients, batch)``."""

@@ -10,7 +10,10 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 
+from fed_envs.state import State
 from sb3_fedguide.common.normalization import FederatedNormalizer
+
+_ARRAYS = ("observations", "next_observations", "actions", "rewards", "terminations")
 
 
 class FederatedReplaySamples(NamedTuple):
@@ -94,6 +97,24 @@ class FederatedReplayBuffer(ReplayBuffer):
     def reset(self) -> None:
         """Forget all transitions."""
         self.sizes[:], self.positions[:] = 0, 0
+
+    def save_state(self) -> State:
+        """The transitions that there are, and where the next ones go."""
+        filled = int(self.sizes.max())
+        arrays = {name: getattr(self, name)[:filled].copy() for name in _ARRAYS}
+        return {"sizes": self.sizes.copy(), "positions": self.positions.copy(), **arrays}
+
+    def load_state(self, state: State) -> None:
+        """Take the transitions of :meth:`save_state`.
+
+        :raises ValueError: where they do not fit, such as those of a larger buffer
+        """
+        for name in _ARRAYS:
+            array, own = state[name], getattr(self, name)
+            if len(array) > self.buffer_size or array.shape[1:] != own.shape[1:]:
+                raise ValueError(f"{name} of shape {array.shape} do not fit into a replay buffer of shape {own.shape}")
+            own[: len(array)] = array
+        self.sizes[:], self.positions[:] = state["sizes"], state["positions"]
 
     def sample(  # type: ignore[override]
         self, batch_size: int, streams: Iterable[tuple[int, np.random.Generator]], normalizer: FederatedNormalizer

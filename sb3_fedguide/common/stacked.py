@@ -5,7 +5,7 @@ One batched matrix product serves all clients, and client k's slice of the state
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import torch as th
 from torch import nn
@@ -53,6 +53,33 @@ def stack_module(module: nn.Module, n_clients: int) -> nn.Module:
     if next(module.parameters(), None) is not None:
         raise TypeError(f"stack_module cannot stack {type(module).__name__}: only Sequential, Linear and activations")
     return module
+
+
+def fixed_forward(layers: Iterable[nn.Module]) -> Callable[[th.Tensor], th.Tensor]:
+    """A chain's forward pass with its present weights, bit for bit, at a third of the price for a few rows.
+
+    It neither records gradients nor goes through module calls, which cost more than the arithmetic of a rollout's step.
+
+    :param layers: stacked affine maps and activations, in order; ``nn.Sequential`` may nest
+    :return: maps ``(n_clients, batch, in_features)`` to ``(n_clients, batch, out_features)``
+    """
+    chain: list[Callable[[th.Tensor], th.Tensor]] = []
+    for layer in layers:
+        if isinstance(layer, nn.Sequential):
+            chain.append(fixed_forward(layer))
+        elif isinstance(layer, StackedLinear) and layer.weight.shape[1] > 1:
+            bias, weight = layer.bias.detach().unsqueeze(1), layer.weight.detach().transpose(1, 2)
+            chain.append(lambda x, bias=bias, weight=weight: th.baddbmm(bias, x, weight))  # type: ignore[misc]
+        else:
+            chain.append(th.tanh if isinstance(layer, nn.Tanh) else layer)
+
+    @th.no_grad()
+    def forward(x: th.Tensor) -> th.Tensor:
+        for function in chain:
+            x = function(x)
+        return x
+
+    return forward
 
 
 def stack_tensor(tensor: th.Tensor, n_clients: int) -> th.Tensor:

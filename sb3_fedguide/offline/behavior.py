@@ -14,6 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from fed_envs.files import atomic_file
+from sb3_fedguide.common.array_files import load_arrays
+
 __all__ = ["BehaviorPolicy", "behavior_policy", "squash"]
 
 POLICY_FOLDER = Path(__file__).parent / "behavior_policies"
@@ -40,10 +43,11 @@ class BehaviorPolicy:
     def __init__(self, arrays: Mapping[str, np.ndarray], noise_scale: float = 1.0) -> None:
         self.arrays = {name: np.asarray(array) for name, array in arrays.items()}
         self.noise_scale = float(noise_scale)
-        required = {"weight_0", "bias_0", "log_std", "obs_mean", "obs_var", "obs_clip", "obs_epsilon"}
+        n_layers = max(1, sum(name.startswith("weight_") for name in self.arrays))
+        required = {f"{kind}_{layer}" for kind in ("weight", "bias") for layer in range(n_layers)}
+        required |= {"log_std", "obs_mean", "obs_var", "obs_clip", "obs_epsilon"}
         if missing := sorted(required - self.arrays.keys()):
             raise ValueError(f"a behaviour policy needs the arrays {sorted(required)}; missing: {missing}")
-        n_layers = sum(name.startswith("weight_") for name in self.arrays)
         numbers = {name: array for name, array in self.arrays.items() if array.dtype.kind in "fiu"}
         if broken := [name for name, array in numbers.items() if not np.isfinite(array).all()]:
             raise ValueError(f"the behaviour policy's arrays {broken} have non-finite entries")
@@ -106,7 +110,7 @@ class BehaviorPolicy:
 
     def save(self, path: str | Path) -> None:
         """Write the policy as an ``npz`` file of plain arrays."""
-        with open(path, "wb") as file:
+        with atomic_file(path, "wb") as file:
             np.savez_compressed(file, **{**self.arrays, "format_version": np.int64(FORMAT_VERSION)})  # type: ignore[arg-type]
 
     @classmethod
@@ -117,14 +121,13 @@ class BehaviorPolicy:
             another format version
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
+            arrays = load_arrays(Path(path))
         except FileNotFoundError as error:
             raise ValueError(f"no behaviour policy file {path}") from error
-        except Exception as error:  # zipfile, zlib and NumPy each have their own; the message says which
+        except ValueError as error:
             raise ValueError(f"{path} is not a behaviour policy (an npz file of plain arrays): {error}") from error
         version = arrays.pop("format_version", None)
-        if version is None or int(version) != FORMAT_VERSION:
+        if version is None or not np.array_equal(version, FORMAT_VERSION):
             raise ValueError(f"{path} has behaviour policy format {version}; this version reads format {FORMAT_VERSION}")
         return cls(arrays, noise_scale)
 

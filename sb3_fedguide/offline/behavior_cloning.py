@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_fedguide.offline.groups import client_groups, train_together
 from sb3_fedguide.offline.progress import StepProgress
 
 __all__ = ["clone"]
@@ -46,6 +48,35 @@ def clone(
     sizes = [len(rows) for rows in observations]
     if sizes != [len(rows) for rows in actions] or min(sizes) == 0:
         raise ValueError(f"every client needs as many actions as observations, at least one; got {sizes} observations")
+
+    def job(group: range) -> Callable[[StepProgress | None], np.ndarray]:
+        part = _clients_view(actor, group)
+        arrays = [observations[k] for k in group], [actions[k] for k in group], [rngs[k] for k in group]
+        return lambda report: _clone_group(part, *arrays, n_updates, batch_size, learning_rate, report)
+
+    return np.concatenate(train_together([job(group) for group in client_groups(len(sizes))], progress))
+
+
+def _clients_view(actor: nn.Module, group: range) -> nn.Module:
+    """The module of some neighbouring clients; its parameters are views of those of ``actor``."""
+    part = copy.deepcopy(actor)
+    for own, whole in zip(part.parameters(), actor.parameters(), strict=True):
+        own.data = whole.data[group.start : group.stop]
+    return part
+
+
+def _clone_group(
+    actor: nn.Module,
+    observations: Sequence[np.ndarray],
+    actions: Sequence[np.ndarray],
+    rngs: Sequence[np.random.Generator],
+    n_updates: int,
+    batch_size: int,
+    learning_rate: float,
+    progress: StepProgress | None,
+) -> np.ndarray:
+    """What :func:`clone` says, for clients that are updated in lockstep."""
+    sizes = [len(rows) for rows in observations]
     starts = np.cumsum([0, *sizes[:-1]])
     obs_table = th.from_numpy(np.concatenate(observations).astype(np.float32))
     action_table = th.from_numpy(np.concatenate(actions).astype(np.float32))

@@ -15,12 +15,17 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["arrays_hash", "cache_folder", "cached_arrays", "content_key", "publish_folder", "read_arrays", "write_arrays"]
+from fed_envs.files import current_umask
+from sb3_fedguide.common.array_files import array_mismatches, arrays_hash, read_arrays, write_arrays
+
+__all__ = [
+    "arrays_hash", "cache_folder", "cached_arrays", "check_cache_folder", "content_key", "keep_arrays", "publish_folder",
+    "read_arrays", "warn_not_kept", "write_arrays",
+]  # fmt: skip
 
 logger = logging.getLogger(__name__)
 
 CACHE_VARIABLE = "FEDGUIDE_CACHE"
-_CHECKSUM = "__sha256__"
 
 
 def cache_folder(path: str | Path | None = None) -> Path:
@@ -33,66 +38,64 @@ def content_key(**parts: Any) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
-def arrays_hash(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of named arrays: names, dtypes, shapes and bytes."""
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name}:{array.dtype.str}:{array.shape};".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
+def cached_arrays(
+    path: Path,
+    build: Callable[[], Mapping[str, np.ndarray]] | None = None,
+    expected: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, np.ndarray] | None:
+    """The entry at ``path``; built and kept first if it is absent, damaged or has not the arrays expected.
 
-
-def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays and their checksum as one npz file that appears complete or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **{**arrays, _CHECKSUM: np.array(arrays_hash(arrays))})  # type: ignore[arg-type]
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read what :func:`write_arrays` wrote.
-
-    :raises ValueError: if the file is damaged, pickled or does not have the checksum of its content
-    :raises FileNotFoundError: if there is none
+    :param build: makes the entry; without it ``None`` is returned instead
+    :param expected: arrays with the entry's names, dtypes and shapes
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # zipfile, zlib, NumPy and the OS each have their own for the same thing
-        raise ValueError(f"{path} is damaged: {error}") from error
-    checksum = arrays.pop(_CHECKSUM, None)
-    if checksum is None or str(checksum) != arrays_hash(arrays):
-        raise ValueError(f"{path} is damaged: its content does not have the checksum that was written with it")
-    return arrays
-
-
-def cached_arrays(path: Path, build: Callable[[], Mapping[str, np.ndarray]] | None = None) -> dict[str, np.ndarray] | None:
-    """The entry at ``path``; built and written first if it is absent or damaged.
-
-    :param build: makes the entry; without it an absent or damaged entry gives ``None``
-    """
-    try:
-        return read_arrays(path)
+        arrays = read_arrays(path)
+        if expected is not None and (mismatches := array_mismatches(arrays, expected)):
+            raise ValueError(f"{path} is an entry of another kind or version: {mismatches[0]}")
+        return arrays
     except FileNotFoundError:
         pass
     except ValueError as error:
-        logger.warning("rebuilding a cache entry: %s", error)
+        logger.warning("making a cache entry again: %s", error)
     if build is None:
         return None
     arrays = dict(build())
-    write_arrays(path, arrays)
+    keep_arrays(path, arrays)
     return arrays
+
+
+def keep_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write a cache entry; where that fails there is a warning, since what was computed is right without it."""
+    try:
+        write_arrays(path, arrays)
+    except OSError as error:
+        warn_not_kept(path, error)
+
+
+def warn_not_kept(path: Path, error: Exception) -> None:
+    """Say that a cache entry could not be written, and what to do."""
+    logger.warning(
+        "%s could not be kept (%s) and will be made again by the next run; free some space there, or choose another cache "
+        "folder with --cache-dir or $%s",
+        path, getattr(error, "strerror", None) or error, CACHE_VARIABLE,
+    )  # fmt: skip
+
+
+def check_cache_folder(folder: Path) -> None:
+    """:raises ValueError: if there is no such cache and none can be made; nothing is created
+
+    A folder that exists but cannot be written to is taken: entries can be read from it.
+    """
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise ValueError(
+            f"the cache folder {folder} cannot be made: {existing} is a file; give another one with --cache-dir or "
+            f"${CACHE_VARIABLE}"
+        )
+    if existing != folder.absolute() and not os.access(existing, os.W_OK):
+        raise ValueError(
+            f"the cache folder {folder} cannot be made in {existing}; give another one with --cache-dir or ${CACHE_VARIABLE}"
+        )
 
 
 @contextmanager
@@ -108,6 +111,7 @@ def publish_folder(target: Path, valid: Callable[[Path], bool]) -> Iterator[Path
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     try:
         yield temporary
+        temporary.chmod(0o777 & ~current_umask())  # mkdtemp makes folders private
         _replace_folder(temporary, target, valid)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -9,7 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 __all__ = ["Piece", "PretrainingConfig"]
 
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, lt=2**31)]
+Size = Annotated[int, Field(ge=1, le=10_000_000)]  # far above what is useful, and below what no memory holds
+Width = Annotated[int, Field(ge=1, le=8192)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Piece = Literal["bc", "prior", "dice"]
 
@@ -32,31 +34,31 @@ class PretrainingConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     dataset: str | None = None
-    dataset_size: Count | None = None
+    dataset_size: Size | None = None
     gamma: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.99
 
     bc_updates: Count = 2000
     bc_epochs: Count | None = None
-    bc_batch_size: Count = 512
+    bc_batch_size: Size = 512
     bc_learning_rate: Positive = 3e-4
 
     prior: Literal["auto", "gaussian", "diffusion"] = "auto"
     prior_updates: Count = 5000
     prior_epochs: Count | None = None
-    prior_batch_size: Count = 128
+    prior_batch_size: Size = 128
     prior_learning_rate: Positive = 5e-3
-    prior_width: Count = 64
+    prior_width: Width = 64
     prior_average_every: Count = 50
 
     dice_updates: Count = 5000
     dice_epochs: Count | None = None
-    dice_batch_size: Count = 128
+    dice_batch_size: Size = 128
     dice_learning_rate: Positive = 1e-4
-    dice_width: Count = 256
+    dice_width: Width = 256
     dice_omega: Positive = 0.5
     dice_tau: Annotated[float, Field(gt=0.0, le=1.0)] = 0.005
     dice_f: Literal["soft_chi", "kl", "chi2"] = "soft_chi"
-    dice_v_coef: float | Literal["1-gamma"] = 1.0
+    dice_v_coef: Annotated[float, Field(allow_inf_nan=False)] | Literal["1-gamma"] = 1.0
 
     def n_updates(self, piece: Piece, n_rows: int) -> int:
         """Updates of a piece on ``n_rows`` rows: its floor, or its epochs if these are more."""

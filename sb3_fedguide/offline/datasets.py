@@ -13,7 +13,14 @@ import numpy as np
 from fed_envs import Family, load_family
 from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.behavior import BehaviorPolicy
-from sb3_fedguide.offline.cache import cache_folder, content_key, publish_folder, read_arrays, write_arrays
+from sb3_fedguide.offline.cache import (
+    cache_folder,
+    content_key,
+    publish_folder,
+    read_arrays,
+    warn_not_kept,
+    write_arrays,
+)
 from sb3_fedguide.offline.collect import behavior_name, collect, default_size, source_key
 from sb3_fedguide.offline.data import OfflineData, normalize_observations
 from sb3_fedguide.offline.minari_io import check_spaces, find_dataset, read_minari, write_minari
@@ -93,25 +100,29 @@ def dataset_folder(
 def _made_on_the_spot(
     folder: Path, family: Family, client: int, size: int, seed: int, policy: BehaviorPolicy | None
 ) -> OfflineData:
-    if folder.exists():
-        try:
-            return _read_entry(folder)
-        except (ValueError, OSError) as error:
-            logger.warning("making the data of client %d again: %s", client, error)
+    try:
+        return _read_entry(folder)
+    except FileNotFoundError:
+        pass
+    except (ValueError, OSError) as error:
+        logger.warning("making the data of client %d again: %s", client, error)
     data, observation_space, action_space = collect(family, client, size, seed, policy)
-    with publish_folder(folder, _is_valid) as temporary:
-        write_minari(
-            temporary,
-            "/".join(folder.parts[-3:]),
-            data,
-            observation_space,
-            action_space,
-            {
-                "algorithm_name": behavior_name(family, client, policy),
-                "description": f"{family.name}, client {client}, made by sb3_fedguide with seed {seed}",
-            },
-        )
-        write_arrays(temporary / ROWS, {**data.arrays(), _FILES_HASH: np.array(_files_hash(temporary))})
+    try:
+        with publish_folder(folder, _is_valid) as temporary:
+            write_minari(
+                temporary,
+                "/".join(folder.parts[-3:]),
+                data,
+                observation_space,
+                action_space,
+                {
+                    "algorithm_name": behavior_name(family, client, policy),
+                    "description": f"{family.name}, client {client}, made by sb3_fedguide with seed {seed}",
+                },
+            )
+            write_arrays(temporary / ROWS, {**data.arrays(), _FILES_HASH: np.array(_files_hash(temporary))})
+    except OSError as error:
+        warn_not_kept(folder, error)
     return data
 
 
@@ -119,15 +130,21 @@ def _read_entry(folder: Path) -> OfflineData:
     """The data in a cache entry, from the flat copy of its rows: Minari reads a thousand short episodes in a second.
 
     :raises ValueError: if the Minari dataset or the copy is damaged or incomplete
+    :raises FileNotFoundError: if there is no such entry
     """
     try:
         arrays = read_arrays(folder / ROWS)
         files_hash = _files_hash(folder)
     except FileNotFoundError as error:
+        if not folder.exists():
+            raise
         raise ValueError(f"{folder} is incomplete: {error}") from error
     if str(arrays.pop(_FILES_HASH, "")) != files_hash:
         raise ValueError(f"{folder} is damaged: its Minari files are not those that were written")
-    return OfflineData(**arrays)
+    try:
+        return OfflineData(**arrays)
+    except TypeError as error:
+        raise ValueError(f"{folder} is an entry of another version: {error}") from error
 
 
 def _files_hash(folder: Path) -> str:

@@ -12,7 +12,7 @@ shifts V by ``omega * log(1 / (1 - gamma)) / (1 - gamma)`` for ``kl`` and stays 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -22,6 +22,7 @@ from torch.nn import functional as F
 
 from sb3_fedguide.offline.conjugates import conjugate
 from sb3_fedguide.offline.data import OfflineData
+from sb3_fedguide.offline.groups import client_groups, train_together
 from sb3_fedguide.offline.progress import StepProgress
 
 __all__ = ["DiceValue", "calibrate", "explained_variance", "train_dice"]
@@ -48,8 +49,8 @@ class StackedMlp(nn.Module):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """``(n_networks, batch, inputs)`` to ``(n_networks, batch)``."""
-        x = F.relu(th.baddbmm(self.bias_0, x, self.weight_0))
-        x = F.relu(th.baddbmm(self.bias_1, x, self.weight_1))
+        x = th.baddbmm(self.bias_0, x, self.weight_0).relu_()
+        x = th.baddbmm(self.bias_1, x, self.weight_1).relu_()
         # A batched product with one output column rounds differently for one network than for several.
         return (x * self.weight_2).sum(dim=-1) + self.bias_2
 
@@ -165,6 +166,31 @@ def train_dice(
     _check(datasets, rngs, n_updates, batch_size, omega, gamma, tau)
     f_conjugate = conjugate(f)
     v_weight = 1.0 - gamma if v_coef == "1-gamma" else float(v_coef)
+
+    def job(group: range) -> Callable[[StepProgress | None], DiceValue]:
+        rows, streams = [datasets[k] for k in group], [rngs[k] for k in group]
+        return lambda report: _train_group(
+            rows, streams, n_updates, batch_size, width, omega, learning_rate, gamma, tau, f_conjugate, v_weight, report
+        )
+
+    return DiceValue.stack(train_together([job(group) for group in client_groups(len(datasets))], progress))
+
+
+def _train_group(
+    datasets: Sequence[OfflineData],
+    rngs: Sequence[np.random.Generator],
+    n_updates: int,
+    batch_size: int,
+    width: int,
+    omega: float,
+    learning_rate: float,
+    gamma: float,
+    tau: float,
+    f_conjugate: Callable[[th.Tensor], th.Tensor],
+    v_weight: float,
+    progress: StepProgress | None,
+) -> DiceValue:
+    """What :func:`train_dice` says, for clients that are updated in lockstep."""
     n_clients, obs_dim, action_dim = len(datasets), datasets[0].observations.shape[1], datasets[0].actions.shape[1]
 
     value = DiceValue(n_clients, obs_dim, width)
@@ -187,8 +213,7 @@ def train_dice(
     rows = _Rows(datasets, value)
     offset, scale = value.offset.unsqueeze(1), value.scale.unsqueeze(1)  # (N, 1, 1): over the two Qs and the batch
 
-    def q_values(net: StackedMlp, state_action: th.Tensor) -> th.Tensor:
-        twice = state_action.unsqueeze(1).expand(-1, 2, -1, -1).reshape(2 * n_clients, batch_size, -1)
+    def q_values(net: StackedMlp, twice: th.Tensor) -> th.Tensor:
         return offset + scale * net(twice).view(n_clients, 2, batch_size)
 
     q_parameters: list[th.Tensor] = list(q_net.parameters())
@@ -200,8 +225,9 @@ def train_dice(
         block = min(_BLOCK, n_updates - start)
         for index in rows.draw(rngs, block, batch_size):
             state, state_action, next_state, reward, discount = rows.batch(index, gamma)
+            twice = state_action.unsqueeze(1).expand(-1, 2, -1, -1).reshape(2 * n_clients, batch_size, -1)
             with th.no_grad():
-                q_min = q_values(q_target, state_action).amin(dim=1)
+                q_min = q_values(q_target, twice).amin(dim=1)
             v = value.standardized(state)
             v_loss = (v_weight * v + omega * f_conjugate((q_min - v) / omega)) / value.scale
             v_optimizer.zero_grad(set_to_none=True)
@@ -210,7 +236,7 @@ def train_dice(
 
             with th.no_grad():
                 q_goal = reward + discount * value.standardized(next_state)
-            q_error = (q_values(q_net, state_action) - q_goal.unsqueeze(1)) / scale
+            q_error = (q_values(q_net, twice) - q_goal.unsqueeze(1)) / scale
             q_optimizer.zero_grad(set_to_none=True)
             q_error.square().mean(dim=2).sum().backward()
             q_optimizer.step()
@@ -218,7 +244,7 @@ def train_dice(
                 th._foreach_lerp_(target_parameters, q_parameters, tau)
         if progress is not None:
             progress(start + block, n_updates)
-    return value.requires_grad_(False)
+    return value
 
 
 class _Rows:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +12,9 @@ import gymnasium as gym
 import minari
 import numpy as np
 from minari.data_collector.episode_buffer import EpisodeBuffer
+from minari.dataset._storages import get_minari_storage
 from minari.dataset.minari_storage import MinariStorage
+from minari.serialization import deserialize_space
 
 from sb3_fedguide.offline.data import OfflineData
 
@@ -44,7 +49,13 @@ def write_minari(
     folder.mkdir(parents=True, exist_ok=True)
     storage = MinariStorage.new(folder / "data", _as_float32(observation_space), _as_float32(action_space), data_format="hdf5")
     storage.update_metadata({"dataset_id": dataset_id, "minari_version": minari.__version__, **metadata})
+    # HDF5 may crash the process when it cannot finish a file, as on a full disk, so it writes to memory.
+    content, path = io.BytesIO(), storage._file_path  # type: ignore[attr-defined]
+    storage._file_path = content  # type: ignore[attr-defined]
     storage.update_episodes(episodes)
+    storage._file_path = path  # type: ignore[attr-defined]
+    path.write_bytes(content.getbuffer())
+    storage.update_metadata({"dataset_size": storage.get_size()})
 
 
 def read_minari(data_path: Path, max_rows: int | None = None, rng: np.random.Generator | None = None) -> OfflineData:
@@ -54,8 +65,8 @@ def read_minari(data_path: Path, max_rows: int | None = None, rng: np.random.Gen
     :param rng: draws the order of the episodes; default as recorded
     :raises ValueError: if there is no readable dataset with Box observations and actions
     """
+    storage = _open(data_path)
     try:
-        storage = MinariStorage.read(data_path)
         order = np.arange(storage.total_episodes)
         if rng is not None:
             rng.shuffle(order)
@@ -83,18 +94,51 @@ def find_dataset(dataset: str) -> Path:
 
     :raises ValueError: if there is none; the message lists the local ones
     """
-    path = Path(dataset).expanduser()
-    for candidate in (path, path / "data"):
-        if (candidate / "metadata.json").is_file():
-            return candidate
+    root = _local_root()
     try:
-        return Path(str(minari.load_dataset(dataset).storage.data_path))
-    except (FileNotFoundError, ValueError) as error:
-        local = ", ".join(minari.list_local_datasets()) or "none"
-        raise ValueError(
-            f"no Minari dataset {dataset!r} on this machine (a path was tried, too). Local datasets: {local}. "
-            f"Fetch a public one with `minari download {dataset}`"
-        ) from error
+        path = Path(dataset).expanduser()
+        for candidate in (path, path / "data", root / dataset / "data"):
+            if (candidate / "metadata.json").is_file():
+                return candidate
+    except (OSError, RuntimeError) as error:  # a name that is too long, or the home of a user who does not exist
+        raise ValueError(f"{dataset!r} is no Minari dataset: {error}") from None
+    local = ", ".join(sorted(_local_datasets(root))) or "none"
+    raise ValueError(
+        f"no Minari dataset {dataset!r} on this machine (a path was tried, too). Local datasets: {local}. "
+        f"Fetch a public one with `minari download {dataset}`"
+    )
+
+
+def _local_root() -> Path:
+    """Where Minari keeps its datasets. Its own functions would make the folder, and import the environment of a dataset."""
+    return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+
+
+def _local_datasets(root: Path) -> Iterator[str]:
+    for metadata in root.rglob("data/metadata.json"):
+        name = metadata.parent.parent.relative_to(root)
+        if not any(part.startswith(".") for part in name.parts):
+            yield name.as_posix()
+
+
+def _open(data_path: Path) -> MinariStorage:
+    """A dataset that says its spaces itself.
+
+    Where it does not, Minari would make the environment that its metadata name, and these can name any function to call.
+
+    :raises ValueError: for metadata that are none, or that do not hold both spaces
+    """
+    try:
+        metadata = MinariStorage.read_raw_metadata(data_path)
+        spaces = [deserialize_space(metadata[f"{kind}_space"]) for kind in ("observation", "action")]
+        storage = get_minari_storage(metadata["data_format"])
+        return storage(data_path, *spaces, jpeg_encoding=bool(metadata.get("jpeg_encoding", True)))
+    except Exception as error:  # the metadata may hold anything
+        raise ValueError(f"{data_path} is not a readable Minari dataset with its own spaces: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    return f"its metadata have no {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
 
 
 def check_spaces(data_path: Path, observation_space: gym.Space, action_space: gym.Space) -> None:
@@ -102,11 +146,8 @@ def check_spaces(data_path: Path, observation_space: gym.Space, action_space: gy
 
     :raises ValueError: naming the spaces of both; observation bounds may differ, action bounds may not
     """
-    try:
-        storage = MinariStorage.read(data_path)
-        theirs = (storage.observation_space, storage.action_space)
-    except Exception as error:  # the metadata may hold anything
-        raise ValueError(f"{data_path} is not a readable Minari dataset: {error}") from error
+    storage = _open(data_path)
+    theirs = (storage.observation_space, storage.action_space)
     for kind, given, needed in zip(("observation", "action"), theirs, (observation_space, action_space), strict=True):
         matches = isinstance(given, gym.spaces.Box) and isinstance(needed, gym.spaces.Box) and given.shape == needed.shape
         if isinstance(given, gym.spaces.Box) and isinstance(needed, gym.spaces.Box) and matches and kind == "action":

@@ -22,7 +22,7 @@ from torch import nn
 from fed_envs import Family, load_family
 from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.behavior_cloning import clone
-from sb3_fedguide.offline.cache import arrays_hash, cache_folder, cached_arrays, content_key, write_arrays
+from sb3_fedguide.offline.cache import arrays_hash, cache_folder, cached_arrays, content_key, keep_arrays
 from sb3_fedguide.offline.config import Piece, PretrainingConfig
 from sb3_fedguide.offline.datasets import OfflineData, client_datasets, normalize_observations
 from sb3_fedguide.offline.dice import DiceValue, train_dice
@@ -30,7 +30,7 @@ from sb3_fedguide.offline.progress import Progress, TqdmProgress, stage_progress
 from sb3_fedguide.offline.trunk import federated_trunk
 from sb3_fedguide.priors import DiffusionPrior, GaussianPrior, HeadStatistics, Prior
 
-__all__ = ["PretrainedPrior", "Pretraining", "PretrainingConfig"]
+__all__ = ["PretrainedPrior", "Pretraining", "PretrainingConfig", "untrained_prior"]
 
 VERSION = 1
 """Raised whenever the same inputs give other results, so that old cache entries are not taken for new ones."""
@@ -156,7 +156,7 @@ class Pretraining:
             )
             return [_client_arrays(actors.named_parameters(), k) for k in range(len(group))]
 
-        entries = self._per_client("bc", keys, train)
+        entries = self._per_client("bc", keys, {name: array[0] for name, array in initial.items()}, train)
         return {name: th.from_numpy(np.stack([entry[name] for entry in entries])) for name in initial}
 
     def trunk(self) -> tuple[Prior, int, int]:
@@ -165,7 +165,9 @@ class Pretraining:
         All clients of the family take part, wherever they live: otherwise a client's prior would depend on its neighbours.
         """
         if self._trunk is None:
-            self._trunk = self._gaussian() if self._prior_kind() == "gaussian" else self._diffusion()
+            data = self.datasets()[0]
+            prior = untrained_prior(self.family, self.config, data.observations.shape[1], data.actions.shape[1], self.seed)
+            self._trunk = self._diffusion(prior) if isinstance(prior, DiffusionPrior) else (prior, 0, 0)
         return self._trunk
 
     def prior(self) -> PretrainedPrior:
@@ -175,19 +177,24 @@ class Pretraining:
         common = arrays_hash({name: tensor.numpy() for name, tensor in prior.state_dict().items()})
         keys = [self._client_key(k, "prior", common=common, kind=type(prior).__name__) for k in range(len(data))]
 
-        def fit(group: list[int], n_updates: int) -> list[Arrays]:
-            entries = []
-            for k in group:
-                rng = stream(self.seed, Role.HEAD, self.client_ids[k])
-                statistics = prior.head_statistics(data[k].observations, data[k].actions, rng)
-                moment = prior.feature_moment(data[k].observations, data[k].actions, rng)
-                entries.append(
-                    {"head": prior.solve_head(statistics), "moment": moment, "gram": statistics.gram,
-                     "cross": statistics.cross, "weight": np.asarray(statistics.weight)}
-                )  # fmt: skip
-            return entries
+        def entry(k: int) -> Arrays:
+            rng = stream(self.seed, Role.HEAD, self.client_ids[k])
+            statistics = prior.head_statistics(data[k].observations, data[k].actions, rng)
+            moment = prior.feature_moment(data[k].observations, data[k].actions, rng)
+            return {
+                "head": prior.solve_head(statistics), "moment": moment, "gram": statistics.gram,
+                "cross": statistics.cross, "weight": np.asarray(statistics.weight),
+            }  # fmt: skip
 
-        entries = self._per_client("prior", keys, fit)
+        def fit(group: list[int], n_updates: int) -> list[Arrays]:
+            return [entry(k) for k in group]
+
+        square, action_dim = (prior.n_features + 1,) * 2, prior.action_dim
+        expected: Arrays = {
+            "head": np.zeros(prior.head_shape, dtype=np.float32), "moment": np.zeros(square), "gram": np.zeros(square),
+            "cross": np.zeros((square[0], action_dim)), "weight": np.zeros(()),
+        }  # fmt: skip
+        entries = self._per_client("prior", keys, expected, fit)
         return PretrainedPrior(
             prior,
             np.stack([entry["head"] for entry in entries]),
@@ -219,27 +226,16 @@ class Pretraining:
             )
             return [_client_arrays(value.state_dict().items(), k) for k in range(len(group))]
 
-        entries = self._per_client("dice", keys, train)
         value = DiceValue(len(data), data[0].observations.shape[1], config.dice_width)
+        entries = self._per_client("dice", keys, _client_arrays(value.state_dict().items(), 0), train)
         value.load_state_dict({name: th.from_numpy(np.stack([entry[name] for entry in entries])) for name in entries[0]})
         return value.requires_grad_(False)
 
-    def _prior_kind(self) -> str:
-        if self.config.prior != "auto":
-            return self.config.prior
-        return "gaussian" if self.family is not None and self.family.world == "bandit2d" else "diffusion"
-
-    def _gaussian(self) -> tuple[Prior, int, int]:
-        data = self.datasets()[0]
-        return GaussianPrior(data.observations.shape[1], data.actions.shape[1]), 0, 0
-
-    def _diffusion(self) -> tuple[Prior, int, int]:
+    def _diffusion(self, prior: DiffusionPrior) -> tuple[Prior, int, int]:
         config = self.config
         everyone = range(self.family.n_clients) if self.family is not None else self.client_ids
         data = self.datasets(everyone)
         n_updates = max(config.n_updates("prior", len(rows)) for rows in data)
-        obs_dim, action_dim = data[0].observations.shape[1], data[0].actions.shape[1]
-        prior = DiffusionPrior(obs_dim, action_dim, width=config.prior_width, rng=stream(self.seed, Role.TRUNK))
         key = content_key(
             version=VERSION, seed=self.seed, clients=list(everyone), data=[rows.content_hash for rows in data],
             architecture=prior.arguments, n_updates=n_updates, **config.settings("prior"),
@@ -260,7 +256,9 @@ class Pretraining:
             traffic = {"bytes_up": np.asarray(trained.upload_bytes), "bytes_down": np.asarray(trained.download_bytes)}
             return {**state, **traffic}
 
-        arrays = cached_arrays(self.cache / "pretraining" / "trunk" / f"{key}.npz", build)
+        expected = {f"state/{name}": tensor.numpy() for name, tensor in prior.state_dict().items()}
+        expected |= {"bytes_up": np.asarray(0), "bytes_down": np.asarray(0)}
+        arrays = cached_arrays(self.cache / "pretraining" / "trunk" / f"{key}.npz", build, expected)
         if arrays is None:
             raise RuntimeError("the trunk was neither cached nor built")
         state = {name: th.from_numpy(array) for name, array in arrays.items() if name.startswith("state/")}
@@ -276,10 +274,15 @@ class Pretraining:
             n_updates=self.config.n_updates(piece, len(data)), **self.config.settings(piece), **more,
         )  # fmt: skip
 
-    def _per_client(self, piece: Piece, keys: Sequence[str], train: Callable[[list[int], int], list[Arrays]]) -> list[Arrays]:
-        """Every client's entry; those that are not cached are trained together, and each is stored by itself."""
+    def _per_client(
+        self, piece: Piece, keys: Sequence[str], expected: Arrays, train: Callable[[list[int], int], list[Arrays]]
+    ) -> list[Arrays]:
+        """Every client's entry; those that are not cached are trained together, and each is stored by itself.
+
+        :param expected: arrays with an entry's names, dtypes and shapes
+        """
         paths = [self.cache / "pretraining" / piece / f"{key}.npz" for key in keys]
-        entries: list[Arrays | None] = [cached_arrays(path) for path in paths]
+        entries: list[Arrays | None] = [cached_arrays(path, expected=expected) for path in paths]
         # In lockstep all train equally long, and a client's length is its own: one group per length.
         groups: dict[int, list[int]] = defaultdict(list)
         for k, client in enumerate(self.client_ids):
@@ -287,9 +290,17 @@ class Pretraining:
                 groups[self.config.n_updates(piece, len(self._data[client]))].append(k)
         for n_updates, group in groups.items():
             for k, arrays in zip(group, train(group, n_updates), strict=True):
-                write_arrays(paths[k], arrays)
+                keep_arrays(paths[k], arrays)
                 entries[k] = arrays
         return [entry for entry in entries if entry is not None]
+
+
+def untrained_prior(family: Family | None, config: PretrainingConfig, obs_dim: int, action_dim: int, seed: int) -> Prior:
+    """The common part of the priors as it is before training, the same wherever it is made."""
+    automatic = "gaussian" if family is not None and family.world == "bandit2d" else "diffusion"
+    if (automatic if config.prior == "auto" else config.prior) == "gaussian":
+        return GaussianPrior(obs_dim, action_dim)
+    return DiffusionPrior(obs_dim, action_dim, width=config.prior_width, rng=stream(seed, Role.TRUNK))
 
 
 def _take_clients(module: nn.Module, indices: list[int]) -> nn.Module:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -18,6 +18,7 @@ import torch as th
 from torch import nn
 
 from sb3_fedguide.common.stacked import StackedLinear, client_state, stack_module
+from sb3_fedguide.offline.groups import client_groups, train_together
 from sb3_fedguide.offline.progress import StepProgress
 from sb3_fedguide.priors.density import training_angle
 from sb3_fedguide.priors.diffusion import DiffusionPrior
@@ -222,17 +223,27 @@ def federated_trunk(
     mean, std = merge_moments(moments)
     prior.set_observation_moments(mean, std)
     upload_bytes, download_bytes = upload_size(moments[0]), upload_size({"mean": mean, "std": std})
-    training = TrunkTraining(prior, datasets, rngs, n_updates, batch_size, learning_rate)
+    trainings = [
+        TrunkTraining(prior, [datasets[k] for k in group], [rngs[k] for k in group], n_updates, batch_size, learning_rate)
+        for group in client_groups(len(datasets))
+    ]
+    n_samples = [n for training in trainings for n in training.n_samples]
+
+    def job(training: TrunkTraining) -> Callable[[StepProgress | None], np.ndarray]:
+        return lambda _: training.run(average_every)
+
     losses = []
-    while training.n_done < n_updates:
-        losses.append(training.run(average_every))
-        uploads = training.uploads()
-        trunk = average_uploads(uploads, training.n_samples)
-        training.receive(trunk)
+    while trainings[0].n_done < n_updates:
+        parts = train_together([job(training) for training in trainings])
+        losses.append(np.concatenate(parts))
+        uploads = [upload for training in trainings for upload in training.uploads()]
+        trunk = average_uploads(uploads, n_samples)
+        for training in trainings:
+            training.receive(trunk)
         upload_bytes += upload_size(uploads[0])
         download_bytes += upload_size(trunk)
         if progress is not None:
-            progress(training.n_done, n_updates)
+            progress(trainings[0].n_done, n_updates)
     prior.trunk.load_state_dict({name: th.from_numpy(value) for name, value in trunk.items()})
     return TrunkResult(prior, np.stack(losses), upload_bytes, download_bytes)
 

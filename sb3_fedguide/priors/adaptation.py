@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fed_envs.state import State, freeze, thaw
 from sb3_fedguide.priors.base import HeadStatistics, Prior
 
 #: Rows of a rollout that enter a refit, and noise draws of each: enough for a few hundred coefficients.
@@ -31,6 +32,16 @@ class HeadAdaptation:
         self.weight, self.temperature = weight, temperature
         self.offline = [statistics * (1.0 / statistics.weight) for statistics in offline]
         self.recent: list[HeadStatistics | None] = [None] * len(self.offline)
+
+    def save_state(self) -> State:
+        """Statistics of all clients, offline and recent, as plain data."""
+        offline = [freeze(vars(part)) for part in self.offline]
+        return {"offline": offline, "recent": [part and freeze(vars(part)) for part in self.recent]}
+
+    def load_state(self, state: State) -> None:
+        """Go on from what :meth:`save_state` returned."""
+        self.offline = [HeadStatistics(**thaw(part)) for part in state["offline"]]
+        self.recent = [part and HeadStatistics(**thaw(part)) for part in state["recent"]]
 
     def refit(
         self,

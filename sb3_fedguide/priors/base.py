@@ -102,6 +102,10 @@ class Prior(nn.Module, ABC):
         :return: float64, ``(p + 1, p + 1)``. It never leaves the client.
         """
 
+    def describes_density(self, heads: np.ndarray | th.Tensor) -> np.ndarray:
+        """Which of some heads ``(n, action_dim, p + 1)`` are those of a density, ``(n,)`` bool."""
+        return np.ones(len(heads), dtype=bool)
+
     @abstractmethod
     def log_prob(
         self, head: np.ndarray | th.Tensor, obs: th.Tensor, actions: th.Tensor, n_steps: int | None = None

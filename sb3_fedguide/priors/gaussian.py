@@ -65,6 +65,10 @@ class GaussianPrior(Prior):
             raise ValueError("mean_and_covariance takes one head; loop over several.")
         return self._moments(heads[0])
 
+    def describes_density(self, heads: np.ndarray | th.Tensor) -> np.ndarray:
+        """Those whose precision is positive definite."""
+        return np.linalg.eigvalsh(_precision(np.asarray(heads, dtype=np.float64))).min(axis=1) > 0.0
+
     def log_prob(
         self, head: np.ndarray | th.Tensor, obs: th.Tensor, actions: th.Tensor, n_steps: int | None = None
     ) -> th.Tensor:
@@ -103,7 +107,7 @@ class GaussianPrior(Prior):
 
     def _moments(self, head: th.Tensor) -> tuple[np.ndarray, np.ndarray]:
         values = head.double().cpu().numpy()
-        precision = -0.5 * (values[:, :-1] + values[:, :-1].T)
+        precision = _precision(values)
         smallest = np.linalg.eigvalsh(precision).min()
         if smallest <= 0.0:
             raise ValueError(
@@ -112,6 +116,12 @@ class GaussianPrior(Prior):
             )
         covariance = np.linalg.inv(precision)
         return covariance @ values[:, -1], 0.5 * (covariance + covariance.T)
+
+
+def _precision(heads: np.ndarray) -> np.ndarray:
+    """Symmetrised precision of one head or of several, ``(..., action_dim, action_dim)``."""
+    matrix = heads[..., :-1]
+    return -0.5 * (matrix + np.swapaxes(matrix, -1, -2))
 
 
 def _with_one(actions: np.ndarray) -> np.ndarray:

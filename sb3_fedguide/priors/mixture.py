@@ -30,7 +30,7 @@ def mixture_log_prob(
     :return: ``(batch,)``; far off the experts' support very negative, callers clip
     :raises ValueError: for a row that is no probability vector, or when no weight reaches ``min_weight``
     """
-    active, weights = active_experts(row, len(experts), min_weight)
+    active, weights = active_experts(row, len(experts), min_weight, prior.describes_density(experts))
     heads = th.as_tensor(experts, dtype=th.float32)[th.from_numpy(active)]
     log_probs = prior.log_prob(heads, obs, actions, n_steps)
     return th.logsumexp(log_probs + th.as_tensor(np.log(weights), dtype=th.float32).unsqueeze(1), dim=0)
@@ -49,15 +49,19 @@ def mixture_sample(
 
     :return: ``(batch, action_dim)``, not clipped
     """
-    active, weights = active_experts(row, len(experts), min_weight)
+    active, weights = active_experts(row, len(experts), min_weight, prior.describes_density(experts))
     heads = th.as_tensor(experts, dtype=th.float32)[th.from_numpy(active)]
     assignment = rng.choice(len(active), size=len(obs), p=weights)
     return prior.sample(heads, obs, rng, assignment, n_steps)
 
 
-def active_experts(row: np.ndarray, n_experts: int, min_weight: float = MIN_WEIGHT) -> tuple[np.ndarray, np.ndarray]:
+def active_experts(
+    row: np.ndarray, n_experts: int, min_weight: float = MIN_WEIGHT, usable: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Indices of the experts that a row uses, and their renormalised weights (float64).
 
+    :param usable: ``(n_experts,)`` bool, which experts are densities at all: the server cannot tell, and a client that lies
+        may have made one that is not; all if ``None``
     :raises ValueError: see :func:`mixture_log_prob`
     """
     row = np.asarray(row, dtype=np.float64)
@@ -65,6 +69,8 @@ def active_experts(row: np.ndarray, n_experts: int, min_weight: float = MIN_WEIG
         raise ValueError(f"A row of mixture weights has one entry per expert, ({n_experts},), got {row.shape}.")
     if not np.isfinite(row).all() or (row < 0.0).any() or abs(row.sum() - 1.0) > 1e-3:
         raise ValueError(f"Mixture weights must be >= 0 and sum to one, got {row}.")
+    if usable is not None:
+        row = np.where(usable, row, 0.0)
     active = np.flatnonzero(row >= max(min_weight, np.finfo(np.float64).tiny))
     if len(active) == 0:
         raise ValueError(f"No mixture weight reaches min_weight={min_weight} (largest: {row.max():.3g}); lower it.")

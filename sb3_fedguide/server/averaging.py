@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 
@@ -23,6 +24,44 @@ def weighted_average(uploads: Mapping[int, Payload], names: list[str]) -> Payloa
     return average
 
 
+AGGREGATORS = ("mean", "median", "trimmed_mean")
+
+
+def combine(
+    uploads: Mapping[int, Payload],
+    names: list[str],
+    aggregator: Literal["mean", "median", "trimmed_mean"],
+    trim_fraction: float,
+) -> Payload:
+    """The arrays ``names`` of all clients in one: their :func:`weighted_average`, or coordinate by coordinate their median or
+    the mean of what is left without the ``floor(trim_fraction * n)`` lowest and as many of the highest (Yin et al. 2018).
+
+    Median and trimmed mean count every client once, whatever number of samples it claims.
+    """
+    if aggregator == "mean":
+        return weighted_average(uploads, names)
+    combined = {}
+    for name in names:
+        ordered = np.sort(np.stack([uploads[client][name] for client in sorted(uploads)]).astype(np.float64), axis=0)
+        n = len(ordered)
+        cut = (n - 1) // 2 if aggregator == "median" else min(int(trim_fraction * n + 1e-9), (n - 1) // 2)
+        combined[name] = ordered[cut : n - cut].mean(axis=0).astype(np.float32)
+    return combined
+
+
+def averaging_is_due(round: int, every: int, until: int | None = None) -> bool:
+    """Whether parameters are averaged after round ``round``: after ``every``, ``2 * every``, ..., and not after ``until``."""
+    return round > 0 and round % every == 0 and (until is None or round <= until)
+
+
+def check_aggregator(aggregator: str, trim_fraction: float) -> None:
+    """:raises ValueError: for an unknown aggregator, or a fraction that leaves nothing"""
+    if aggregator not in AGGREGATORS:
+        raise ValueError(f"aggregator={aggregator!r} must be one of {', '.join(AGGREGATORS)}")
+    if not 0 <= trim_fraction < 0.5:
+        raise ValueError(f"trim_fraction={trim_fraction} must lie in [0, 0.5): so much is left out on either side")
+
+
 class Averaging(Strategy):
     """Averages every uploaded array whose name begins with one of ``prefixes`` and sends the average to all.
 
@@ -31,18 +70,34 @@ class Averaging(Strategy):
     :param prefixes: what to average; everything by default
     :param average_every: after rounds ``average_every``, ``2 * average_every``, ...
     :param average_until: not after later rounds than this; ``None`` for no end
+    :param aggregator: what takes the place of the average, see :func:`combine`
+    :param trim_fraction: what ``"trimmed_mean"`` leaves out on either side
+    :raises ValueError: for an unknown aggregator, or a fraction that leaves nothing
     """
 
-    def __init__(self, prefixes: tuple[str, ...] = ("",), average_every: int = 1, average_until: int | None = None) -> None:
+    def __init__(
+        self,
+        prefixes: tuple[str, ...] = ("",),
+        average_every: int = 1,
+        average_until: int | None = None,
+        aggregator: Literal["mean", "median", "trimmed_mean"] = "mean",
+        trim_fraction: float = 0.25,
+    ) -> None:
         super().__init__()
+        check_aggregator(aggregator, trim_fraction)
         self.prefixes = prefixes
         self.average_every = average_every
         self.average_until = average_until
+        self.aggregator: Literal["mean", "median", "trimmed_mean"] = aggregator
+        self.trim_fraction = trim_fraction
         self._latest: Payload = {}
 
     def is_due(self, round: int) -> bool:
         """Whether the parameters are averaged after round ``round``."""
-        return round > 0 and round % self.average_every == 0 and (self.average_until is None or round <= self.average_until)
+        return averaging_is_due(round, self.average_every, self.average_until)
+
+    def _combine(self, uploads: Mapping[int, Payload], names: list[str]) -> Payload:
+        return combine(uploads, names, self.aggregator, self.trim_fraction)
 
     def aggregate(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:
         self.metrics = {}
@@ -50,7 +105,7 @@ class Averaging(Strategy):
         names = [name for name in first if name != N_SAMPLES and name.startswith(self.prefixes)]
         if not self.is_due(round) or not names:
             return {client: {} for client in uploads}
-        average = weighted_average(uploads, names)
+        average = self._combine(uploads, names)
         drifts = [
             np.sqrt(sum(float(np.sum((payload[name] - average[name]) ** 2, dtype=np.float64)) for name in names))
             for payload in uploads.values()

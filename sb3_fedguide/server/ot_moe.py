@@ -15,6 +15,10 @@ COST_ROW = "prior.cost_row"
 EXPERTS = "prior.experts"
 MIXTURE_ROW = "prior.mixture_row"
 
+# POT looks at the marginals in its first and every tenth iteration after it.
+_ITERATIONS, _MAX_RUNS = 11, 900
+_DAMPING = 0.01
+
 for _backend in ("PYTORCH", "JAX", "CUPY", "TENSORFLOW"):  # importing POT with all its backends takes seconds
     os.environ.setdefault(f"POT_BACKEND_DISABLE_{_backend}", "1")
 
@@ -41,6 +45,10 @@ def sinkhorn_plan(
 ) -> TransportPlan:
     """Entropic optimal transport plan (paper, Eq. ot-plan) by POT's log-domain Sinkhorn.
 
+    Near a permutation the iterations converge like ``1 / k``: thousands of them. So POT iterates in short runs, each of which
+    starts from the last one's potentials after a Newton step (:func:`_newton_step`) that the iterations would creep along.
+    What is returned comes from POT, and its marginals are checked here.
+
     :param cost: ``(n_clients, n_experts)``, finite, nonnegative, already scaled
     :param eta: entropic regularisation
     :param row_marginal: mu, uniform by default; ``column_marginal``, nu, alike
@@ -56,22 +64,64 @@ def sinkhorn_plan(
     n, m = cost.shape
     mu = np.full(n, 1 / n) if row_marginal is None else np.asarray(row_marginal, dtype=np.float64)
     nu = np.full(m, 1 / m) if column_marginal is None else np.asarray(column_marginal, dtype=np.float64)
-    mass, log = ot.sinkhorn(
-        mu,
-        nu,
-        cost,
-        reg=eta,
-        method="sinkhorn_log",
-        numItermax=10_000,
-        stopThr=1e-5 / n,
-        log=True,
-        warn=False,
-        warmstart=start,
-    )
+    scaled = cost / eta
+    for _ in range(_MAX_RUNS):
+        with np.errstate(over="ignore"):  # POT also returns exp(potentials), which may be beyond what a float holds
+            mass, log = ot.sinkhorn(
+                mu,
+                nu,
+                cost,
+                reg=eta,
+                method="sinkhorn_log",
+                numItermax=_ITERATIONS,
+                stopThr=1e-5 / n,
+                log=True,
+                warn=False,
+                warmstart=start,
+            )
+        potentials = log["log_u"], log["log_v"]
+        if log["err"][-1] < 1e-5 / n:
+            break
+        start = _newton_step(scaled, mu, nu, mass, potentials)
     error = float(max(np.abs(mass.sum(1) - mu).max(), np.abs(mass.sum(0) - nu).max()))
     if not error <= 1e-4 / n:
         raise RuntimeError(f"Sinkhorn left a marginal error of {error:.1e} at eta={eta}; use a larger eta")
-    return TransportPlan(mass, error, (log["log_u"], log["log_v"]))
+    return TransportPlan(mass, error, potentials)
+
+
+def _newton_step(
+    scaled_cost: np.ndarray, mu: np.ndarray, nu: np.ndarray, mass: np.ndarray, potentials: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Potentials after a step on the dual of the columns, whose rows are exact; as they were where it does not help.
+
+    With the row potentials eliminated, the dual is concave in the M column potentials, its gradient is what the columns lack
+    and its Hessian ``-(diag(q) - P^T diag(1 / mu) P)`` with ``q = P^T 1``. The damping vanishes with the error, so that the
+    step converges quadratically, and it keeps a step finite where the plan is a permutation and the Hessian vanishes.
+
+    :param scaled_cost: the costs over eta
+    :param mass: the plan of ``potentials``, whose rows sum to ``mu``
+    """
+    columns = mass.sum(axis=0)
+    missing = nu - columns
+    error = np.linalg.norm(missing)
+    hessian = np.diag(columns) - mass.T @ (mass / mu[:, None])
+    step = np.linalg.solve(hessian + _DAMPING * error * np.eye(len(nu)), missing)
+    for length in (1.0, 0.25, 0.0625):
+        log_v = potentials[1] + length * step
+        log_kernel = log_v - scaled_cost
+        peak = log_kernel.max(axis=1, keepdims=True)
+        kernel = np.exp(log_kernel - peak)
+        total = kernel.sum(axis=1)
+        if np.linalg.norm(nu - (mu / total) @ kernel) < error:
+            return np.log(mu / total) - peak[:, 0], log_v
+    return potentials
+
+
+def head_costs(heads: np.ndarray, experts: np.ndarray) -> np.ndarray:
+    """Squared distances between heads ``(n_clients, ...)`` and experts ``(n_experts, ...)``, ``(n_clients, n_experts)``."""
+    flat = heads.reshape(len(heads), -1).astype(np.float64)
+    # One expert after the other: all differences at once are n_clients * n_experts heads.
+    return np.stack([((flat - expert.reshape(-1)) ** 2).sum(axis=1) for expert in experts], axis=1)
 
 
 def scale_cost(cost: np.ndarray, scaling: Literal["max", "median"]) -> np.ndarray:
@@ -147,13 +197,18 @@ class OTMoE(Strategy):
     def needs_setup(self) -> bool:
         return self.plan is None
 
+    @property
+    def norm_groups(self) -> tuple[str, ...]:
+        return (HEAD, COST_ROW)
+
     def aggregate(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:
         clients = sorted(uploads)
         heads = np.stack([uploads[client][HEAD] for client in clients])
         if self.experts is None:
             self.experts = farthest_points(heads, self.n_experts, self.rng)
             if self.cost == "score":  # rows need the experts first
-                return {client: {EXPERTS: self.experts.copy()} for client in clients}
+                experts = self._broadcast_experts()
+                return {client: {EXPERTS: experts} for client in clients}
         raw = self._costs(heads, uploads, clients)
         cost = scale_cost(raw, self.cost_scaling)
         start = self._potentials if self._potentials is not None and len(self._potentials[0]) == len(clients) else None
@@ -163,26 +218,34 @@ class OTMoE(Strategy):
         if round > 0:  # the first plan routes to the seeded experts as they are
             self._update_experts(heads)
         self._measure(cost, rows, error)
-        return {client: {EXPERTS: self.experts.copy(), MIXTURE_ROW: self.rows[client]} for client in clients}
+        experts = self._broadcast_experts()
+        return {client: {EXPERTS: experts, MIXTURE_ROW: self.rows[client]} for client in clients}
 
     def latest(self, client: int) -> Payload:
         if self.experts is None:
             return {}
-        row = {MIXTURE_ROW: self.rows[client]} if client in self.rows else {}
-        return {EXPERTS: self.experts.copy(), **row}
+        # Who is new to the server knows nothing of the experts yet.
+        row = self.rows.get(client, np.full(self.n_experts, 1 / self.n_experts, dtype=np.float32))
+        return {EXPERTS: self.experts.copy(), MIXTURE_ROW: row}
+
+    def _broadcast_experts(self) -> np.ndarray:
+        """The experts as they are now, once for all clients: nobody may write into what the others get too."""
+        assert self.experts is not None
+        experts = self.experts.copy()
+        experts.flags.writeable = False
+        return experts
 
     def _costs(self, heads: np.ndarray, uploads: Mapping[int, Payload], clients: list[int]) -> np.ndarray:
         if self.cost == "score":
             return np.stack([uploads[client][COST_ROW] for client in clients]).astype(np.float64)
         assert self.experts is not None
-        difference = heads[:, None].astype(np.float64) - self.experts[None]
-        return (difference**2).reshape(len(clients), self.n_experts, -1).sum(axis=2)
+        return head_costs(heads, self.experts)
 
     def _update_experts(self, heads: np.ndarray) -> None:
         assert self.plan is not None and self.experts is not None
         load = self.plan.sum(axis=0)
         weights = self.plan / np.maximum(load, np.finfo(float).tiny)
-        updated = np.einsum("im,i...->m...", weights, heads.astype(np.float64)).astype(np.float32)
+        updated = np.tensordot(weights, heads.astype(np.float64), axes=(0, 0)).astype(np.float32)
         served = load > 1e-12  # an expert that nobody is routed to stays as it is
         self.experts = np.where(served.reshape(-1, *([1] * (heads.ndim - 1))), updated, self.experts)
 

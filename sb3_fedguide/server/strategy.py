@@ -4,34 +4,87 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from sb3_fedguide.server.payload import N_SAMPLES, Payload
+from sb3_fedguide.server.validation import UPLOAD_BOUND, check_uploads
 
-#: What crosses between a client and the server in one direction: named arrays, float32 but for counts.
-Payload = dict[str, np.ndarray]
+if TYPE_CHECKING:
+    from fed_envs.state import State
 
-#: Key of an upload's number of samples, the weight of its client in averages.
-N_SAMPLES = "n_samples"
+__all__ = ["N_SAMPLES", "Composite", "Payload", "Strategy"]
 
 
 class Strategy(ABC):
     """Aggregates one round's uploads into a broadcast for each client.
 
-    It runs in process or behind a network, and knows neither torch nor environments.
+    It runs in process or behind a network, and knows neither torch nor environments. Whatever carries payloads calls
+    :meth:`exchange` and :meth:`catch_up`; a method defines :meth:`aggregate` and :meth:`latest`.
     """
 
     def __init__(self) -> None:
-        #: figures of the last :meth:`aggregate`, logged under ``federated/``
+        #: figures of the last exchange, logged under ``federated/``
         self.metrics: dict[str, float] = {}
+        #: how far norms of uploads may exceed the median, see :func:`check_uploads`; ``None`` for no checks at all
+        self.upload_bound: float | None = UPLOAD_BOUND
+        #: clients whose uploads the last exchange rejected, and why
+        self.rejected: dict[int, str] = {}
+        #: what each client was last sent under each name
+        self.sent: dict[int, Payload] = {}
 
     @property
     def needs_setup(self) -> bool:
         """Whether another exchange is needed before the first round."""
         return False
 
+    @property
+    def norm_groups(self) -> tuple[str, ...]:
+        """How the names of arrays begin whose norms are checked apart from those of all other arrays."""
+        return ()
+
+    def exchange(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:
+        """Check the uploads, and aggregate those that pass.
+
+        A client whose upload is rejected is treated as if it were absent: it receives nothing now, and what :meth:`catch_up`
+        says before it trains again. Only in the setup before the first round, where it has nothing yet, it receives that at
+        once.
+
+        :param round: 0 before the first round, h after the h-th
+        :param uploads: payload by client id
+        :return: broadcast by client id, for those that receive one
+        :raises ClientError: where the setup finds no upload that it can use
+        """
+        self.rejected = {}
+        if self.upload_bound is not None:
+            self.rejected = check_uploads(uploads, self.sent, self.norm_groups, self.upload_bound)
+        accepted = {client: payload for client, payload in uploads.items() if client not in self.rejected}
+        in_setup, self.metrics = self.needs_setup, {}
+        broadcasts = self.aggregate(round, accepted) if accepted else {}
+        if in_setup:
+            if not accepted:
+                reasons = "; ".join(f"client {client}, {reason}" for client, reason in self.rejected.items())
+                from fed_envs.faults import ClientError
+
+                raise ClientError(list(uploads), f"the server cannot begin, because it rejects every upload: {reasons}")
+            broadcasts.update({client: self.latest(client) for client in self.rejected})
+        self._remember(broadcasts)
+        if self.upload_bound is not None:
+            self.metrics["rejected"] = float(len(self.rejected))
+        return broadcasts
+
+    def catch_up(self, client: int) -> Payload:
+        """What a client that missed exchanges receives before it trains again."""
+        payload = self.latest(client)
+        self._remember({client: payload})
+        return payload
+
+    def _remember(self, broadcasts: Mapping[int, Payload]) -> None:
+        for client, payload in broadcasts.items() if self.upload_bound is not None else ():
+            self.sent.setdefault(client, {}).update({name: array.copy() for name, array in payload.items()})
+
     @abstractmethod
     def aggregate(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:
-        """Combine the uploads of the clients that are present.
+        """Combine the uploads of the clients that are present and have passed the checks.
 
         :param round: 0 before the first round, h after the h-th
         :param uploads: payload by client id
@@ -39,8 +92,29 @@ class Strategy(ABC):
         """
 
     def latest(self, client: int) -> Payload:
-        """What a client that missed exchanges receives before it trains again."""
+        """What a client is to have that received nothing in the last exchanges."""
         return {}
+
+    def save_state(self) -> State:
+        """Everything that the server remembers, as plain data for a checkpoint: all attributes.
+
+        :raises ValueError: where an attribute is neither plain data nor has ``save_state`` and ``load_state`` itself
+        """
+        return {name: _saved(value) for name, value in vars(self).items()}
+
+    def load_state(self, state: State) -> None:
+        """Go on from what :meth:`save_state` returned, on a strategy with the same settings."""
+        for name, saved in state.items():
+            own: Any = getattr(self, name, None)
+            if hasattr(own, "load_state"):
+                own.load_state(saved)
+            elif _have_state(own):
+                for part, part_saved in zip(own, saved, strict=True):
+                    part.load_state(part_saved)
+            else:
+                from fed_envs.state import thaw  # the server needs no environments until it is checkpointed
+
+                setattr(self, name, thaw(saved))
 
 
 class Composite(Strategy):
@@ -54,6 +128,10 @@ class Composite(Strategy):
     def needs_setup(self) -> bool:
         return any(strategy.needs_setup for strategy in self.strategies)
 
+    @property
+    def norm_groups(self) -> tuple[str, ...]:
+        return tuple(prefix for strategy in self.strategies for prefix in strategy.norm_groups)
+
     def aggregate(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:
         merged: dict[int, Payload] = {client: {} for client in uploads}
         self.metrics = {}
@@ -65,3 +143,15 @@ class Composite(Strategy):
 
     def latest(self, client: int) -> Payload:
         return {name: array for strategy in self.strategies for name, array in strategy.latest(client).items()}
+
+
+def _have_state(value: Any) -> bool:
+    return isinstance(value, list) and len(value) > 0 and all(hasattr(part, "save_state") for part in value)
+
+
+def _saved(value: Any) -> Any:
+    if hasattr(value, "save_state"):
+        return value.save_state()
+    from fed_envs.state import freeze
+
+    return [part.save_state() for part in value] if _have_state(value) else freeze(value)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sb3_fedguide.server.averaging import Averaging, weighted_average
+from sb3_fedguide.server.averaging import Averaging
 from sb3_fedguide.server.strategy import Payload
 
 #: Prefix of a direction's arrays; the rest is the name of the parameter that it belongs to.
@@ -19,12 +19,16 @@ class SVRPG(Averaging):
     Parameters are those of :class:`Averaging`.
     """
 
+    @property
+    def norm_groups(self) -> tuple[str, ...]:
+        return (DIRECTION,)
+
     def aggregate(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:
         broadcasts = super().aggregate(round, uploads)
         names = [name for name in next(iter(uploads.values())) if name.startswith(DIRECTION)]
         if not self.is_due(round) or not names:
             return broadcasts
-        direction = weighted_average(uploads, names)
+        direction = self._combine(uploads, names)
         norm, norms = _norm(direction, names), [_norm(payload, names) for payload in uploads.values()]
         # 1 where all clients agree on the direction, near 0 where they cancel
         self.metrics.update(direction_norm=norm, direction_agreement=norm / max(float(np.mean(norms)), 1e-30))

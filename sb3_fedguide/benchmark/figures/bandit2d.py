@@ -44,10 +44,10 @@ def draw(
     axes = figure.subplots(1 + len(methods), columns)
 
     top = axes[0]
-    _density(top[0], reward(points), "reward: four equal peaks", "inferno")
+    draw_density(top[0], reward(points), "reward: four equal peaks", "inferno")
     _data(top[1], data)
     _contours(top[2], priors.clients, "each client's own prior")
-    _density(top[3], priors.server, "OT-MoE global prior")
+    draw_density(top[3], priors.server, "OT-MoE global prior")
     _curves(top[4], results)
     for blank in top[5:]:
         blank.axis("off")
@@ -56,14 +56,14 @@ def draw(
         guided = method.shared is None
         densities = method.deployed.density(points)
         for client in range(n_clients):
-            _density(row[client], densities[client], f"client {client}")
+            draw_density(row[client], densities[client], f"client {client}")
             if guided:
-                _outline(row[client], priors.personal[client])
+                draw_outline(row[client], priors.personal[client])
             row[client].plot(*method.deployed.mean[client], "+", color="white", markersize=9, markeredgewidth=2)
         if method.shared is None:
-            _density(row[-1], densities.mean(axis=0), "all clients' policies")
+            draw_density(row[-1], densities.mean(axis=0), "all clients' policies")
         else:
-            _density(row[-1], method.shared.density(points)[0], "broadcast policy")
+            draw_density(row[-1], method.shared.density(points)[0], "broadcast policy")
         row[0].set_ylabel(method.name, fontsize=14, fontweight="bold")
         measures = method.measures()
         row[-1].set_xlabel(
@@ -76,7 +76,8 @@ def draw(
     figure.savefig(path, dpi=130)
 
 
-def _density(axes: Axes, values: np.ndarray, title: str, color_map: str = DENSITY_MAP) -> None:
+def draw_density(axes: Axes, values: np.ndarray, title: str, color_map: str = DENSITY_MAP) -> None:
+    """A density on :func:`grid` as colours, with the four peaks as circles."""
     extent = (-ACTION_LIMIT, ACTION_LIMIT, -ACTION_LIMIT, ACTION_LIMIT)
     axes.imshow(values.reshape(N_GRID, N_GRID), origin="lower", extent=extent, cmap=color_map)
     _peaks(axes, "white")
@@ -92,7 +93,8 @@ def _contours(axes: Axes, densities: np.ndarray, title: str) -> None:
     _frame(axes, title)
 
 
-def _outline(axes: Axes, density: np.ndarray) -> None:
+def draw_outline(axes: Axes, density: np.ndarray) -> None:
+    """Where a density on :func:`grid` has fallen to that of two standard deviations of a Gaussian."""
     level = density.max() * np.exp(-2.0)
     axes.contour(*_mesh(), density.reshape(N_GRID, N_GRID), [level], colors=["#ffb000"], linewidths=1.4, linestyles="dashed")
 

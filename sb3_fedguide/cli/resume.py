@@ -1,0 +1,139 @@
+"""Going on with a run that was stopped: its own settings, its newest checkpoint, its own files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_fedguide.algorithms import ALGORITHMS
+from sb3_fedguide.cli.arguments import train_parser
+from sb3_fedguide.cli.names import check_names
+
+if TYPE_CHECKING:
+    from fed_envs import Family
+    from sb3_fedguide.cli.config import Config
+
+#: Flags that change nothing in what a run computes, so that they may differ from the run's own.
+FREE = ("verbose", "progress", "save_freq", "picture_freq", "num_threads", "cache_dir", "gym_packages", "resume")
+
+
+def given_flags(argv: Sequence[str] | None, prog: str) -> dict[str, Any]:
+    """Those that stand on the command line, by the names that they have in ``args.yml``."""
+    parser = train_parser(prog)
+    for action in parser._actions:
+        action.default = argparse.SUPPRESS
+    return vars(parser.parse_args(argv))
+
+
+def read_arguments(folder: Path, given: Mapping[str, Any], prog: str) -> argparse.Namespace:
+    """The flags that a run was started with, and those that are given now and are free.
+
+    :raises ValueError: if ``folder`` is none of a run, or a given flag contradicts the run's own
+    """
+    saved = _read_yaml(folder, "args.yml")
+    parser = train_parser(prog)
+    arguments = parser.parse_args([])
+    for action in parser._actions:
+        name = action.dest
+        if name in saved and name != "resume":
+            if not _is_possible(action, saved[name]):
+                raise ValueError(f"{folder / 'args.yml'} is damaged: {name} is {saved[name]!r}")
+            setattr(arguments, name, saved[name])
+    if arguments.seed < 0:
+        raise ValueError(f"{folder / 'args.yml'} is damaged: the run's own seed is not negative")
+    flags = {action.dest: action.option_strings[-1] for action in parser._actions}
+    for name, value in given.items():
+        if name in FREE:
+            setattr(arguments, name, value)
+        elif _comparable(name, value) != _comparable(name, getattr(arguments, name)):
+            raise ValueError(
+                f"{flags[name]} {value} contradicts the run in {folder}, whose own is {getattr(arguments, name)}; leave it "
+                "out, or start a new run"
+            )
+    return arguments
+
+
+def _is_possible(action: argparse.Action, value: Any) -> bool:
+    if value is None:
+        return action.default is None
+    if action.nargs == "+":
+        return isinstance(value, list) and all(isinstance(item, str) for item in value)
+    kind = bool if action.nargs == 0 else action.type or str
+    return type(value) is kind and (action.choices is None or value in action.choices)
+
+
+def _comparable(name: str, value: Any) -> Any:
+    return str(Path(value).absolute()) if name in ("log_folder", "tensorboard_log", "metadata") and value else value
+
+
+def _read_yaml(folder: Path, name: str) -> dict[str, Any]:
+    from sb3_fedguide.cli.config import read_yaml
+
+    if not (folder / name).is_file():
+        raise ValueError(
+            f"{folder} is no folder of a run that can go on: it has no {name}; give one such as logs/fedguide/HopperHard_1"
+        )
+    content = read_yaml(folder / name)
+    if not isinstance(content, dict):
+        raise ValueError(f"{folder / name} is damaged: it is not a mapping")
+    return content
+
+
+def read_settings(folder: Path, algo: str) -> tuple[Config, Family]:
+    """A run's own hyperparameters and clients.
+
+    :raises ValueError: where one of its files is missing or damaged
+    """
+    from fed_envs.metadata import read_family
+    from sb3_fedguide.cli.config import Config, complete
+
+    check_names([algo], ALGORITHMS, "algorithm")
+    try:
+        config = Config(algo, "", complete(_read_yaml(folder, "config.yml"), algo))
+    except ValueError as error:
+        raise ValueError(f"{folder / 'config.yml'}: {error}") from None
+    if not (folder / "metadata.json").is_file():
+        raise ValueError(f"{folder} is no folder of a run that can go on: it has no metadata.json")
+    return config, read_family(folder / "metadata.json")
+
+
+def finished_rounds(folder: Path) -> int | None:
+    """How many rounds a run that is over has had; ``None`` for one that can go on."""
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        return int(summary["rounds_done"]) if summary["finished"] else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # it was killed, or interrupted
+
+
+def load_checkpoint(folder: Path, load: Callable[[Path], Any], prog: str) -> bool:
+    """Hand the folder of checkpoints to ``load``; where there are none, make the run begin from the beginning.
+
+    :return: whether there was one
+    :raises ValueError: if none can be read
+    """
+    from sb3_fedguide.cli.run_folder import CHECKPOINTS, EVALUATIONS, versions
+    from sb3_fedguide.common.checkpoint import checkpoints
+
+    if not checkpoints(folder / CHECKPOINTS):
+        (folder / EVALUATIONS).unlink(missing_ok=True)
+        return False
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load(folder / CHECKPOINTS)
+    messages = [str(warning.message) for warning in caught if warning.category is UserWarning]
+    try:
+        before = json.loads((folder / "versions.json").read_text(encoding="utf-8"))
+        changed = [f"{name} {before[name]}" for name, version in versions().items() if before.get(name, version) != version]
+    except (OSError, ValueError, AttributeError):
+        changed = []
+    if changed:
+        messages.append(f"the run began with {', '.join(changed)}; its results may differ from those without interruption")
+    for message in messages:
+        print(f"{prog}: warning: {message}", file=sys.stderr)
+    return True

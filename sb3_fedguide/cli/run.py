@@ -1,0 +1,198 @@
+"""One run: its folder, its log, its training, and what is written at its end."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_fedguide.cli.signals import StopSignals
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.logger import TensorBoardOutputFormat
+
+    from fed_envs import Family
+    from sb3_fedguide.cli.config import Config
+    from sb3_fedguide.common.callbacks import RoundCallback
+    from sb3_fedguide.common.federated_ddpg import FederatedDDPG
+    from sb3_fedguide.common.federated_ppo import FederatedPPO
+
+EXIT_USAGE = 2
+
+
+class Run:
+    """A run whose inputs are all known to be sound; calling it trains."""
+
+    def __init__(
+        self,
+        arguments: argparse.Namespace,
+        command: str,
+        config: Config,
+        family: Family,
+        model: FederatedPPO | FederatedDDPG,
+        folder: Path | None = None,
+    ) -> None:
+        """:param folder: where the run is, if it goes on"""
+        self.folder = folder
+        #: what keeps other processes out of that folder
+        self.lock = ExitStack()
+        self.arguments, self.command, self.config, self.family, self.model = arguments, command, config, family, model
+
+    def __call__(self) -> int:
+        from sb3_fedguide.cli.run_folder import create_run_folder, exclusive
+
+        arguments = self.arguments
+        if self.folder is not None:
+            with self.lock:
+                with (self.folder / "command.txt").open("a", encoding="utf-8") as file:
+                    file.write(self.command + "\n")
+                return self._run(self.folder)
+        folder = create_run_folder(Path(arguments.log_folder), arguments.algo, self.family.name)
+        with exclusive(folder):
+            self._record_inputs(folder)
+            return self._run(folder)
+
+    def _run(self, folder: Path) -> int:
+        from sb3_fedguide.cli.report import print_summary
+        from sb3_fedguide.cli.run_folder import DEPLOYED, PARAMETERS, write_deployed, write_json
+        from sb3_fedguide.common.checkpoint import CheckpointError
+
+        arguments, model = self.arguments, self.model
+        self._set_logger(folder)
+        if arguments.verbose:
+            begun = f", going on after round {model.round}" if self.folder is not None else ""
+            print(f"{arguments.algo} on {self.family.name}: {model.n_clients} clients, {self.config.n_rounds} rounds, "
+                  f"writing to {folder}{begun}", flush=True)  # fmt: skip
+        exit_code, signals = 0, StopSignals()
+        try:
+            with signals:
+                self._train(folder, signals)
+        except KeyboardInterrupt:
+            where = f"round {model.round + 1}" if model.pretrained else "the offline stage"
+            print(f"\ninterrupted in {where}; {self._what_stays(folder)}", file=sys.stderr)
+            exit_code = signals.exit_code
+        except (OfflineStageError, CheckpointError) as error:
+            stage = "" if isinstance(error, CheckpointError) else " in the offline stage"
+            print(f"error{stage}: {one_message(error)}", file=sys.stderr)
+            return EXIT_USAGE
+        else:
+            if signals.received is not None and model.round < self.config.n_rounds:
+                print(f"interrupted in round {model.round}, which is complete; {self._what_stays(folder)}", file=sys.stderr)
+                exit_code = signals.exit_code
+        finally:
+            model.logger.close()
+        if model.round > 0:
+            model.save(folder / "model.zip")
+            model.export_parameters(folder / PARAMETERS)
+            if deployed := self._deployed.replaced():
+                write_deployed(folder, deployed)
+            else:
+                (folder / DEPLOYED).unlink(missing_ok=True)  # of an earlier part of this run
+        summary = self._summary()
+        write_json(folder / "summary.json", summary)
+        if arguments.verbose:
+            print_summary(summary, str(folder))
+        return exit_code
+
+    def _what_stays(self, folder: Path) -> str:
+        return f"what there is stays in {folder}, and --resume {folder} goes on with it"
+
+    def _record_inputs(self, folder: Path) -> None:
+        from sb3_fedguide.cli.run_folder import versions, write_json, write_text, write_yaml
+
+        write_yaml(folder / "config.yml", self.config.values)
+        events = self.arguments.tensorboard_log
+        tensorboard_log = None if events is None else str(Path(events).absolute())  # a run may go on from another folder
+        arguments = {**vars(self.arguments), "seed": self.model.seed, "tensorboard_log": tensorboard_log}
+        write_yaml(folder / "args.yml", arguments)
+        write_text(folder / "command.txt", self.command + "\n")
+        write_json(folder / "versions.json", versions())
+        self.family.dump(folder / "metadata.json")
+        write_text(folder / "metadata.sha256", self.family.content_hash + "\n")
+
+    def _set_logger(self, folder: Path) -> None:
+        from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
+
+        arguments = self.arguments
+        events = folder / "tb"
+        if arguments.tensorboard_log is not None:
+            number = folder.name.rsplit("_", 1)[-1]
+            events = Path(arguments.tensorboard_log) / self.family.name / f"{arguments.algo}_{number}"
+        loud = arguments.verbose == 2 or (arguments.verbose == 1 and not arguments.progress)
+        events_output = TensorBoardOutputFormat(str(events))
+        if self.folder is not None:
+            forget_later_events(events_output, self.model.num_timesteps)
+        outputs: list[KVWriter] = [events_output]
+        if loud:
+            outputs.append(HumanOutputFormat(sys.stdout))
+        self.model.set_logger(Logger(str(events), outputs))
+
+    def _train(self, folder: Path, signals: StopSignals) -> None:
+        from sb3_fedguide.cli.recorder import CostCallback, DeployedCallback, RunEvalCallback, StopCallback
+        from sb3_fedguide.cli.run_folder import CHECKPOINTS, EVALUATIONS
+        from sb3_fedguide.common.checkpoint import CheckpointCallback
+
+        arguments, model = self.arguments, self.model
+        self._costs, self._deployed, self._evaluation = CostCallback(), DeployedCallback(), None
+        if not arguments.no_eval:
+            self._evaluation = RunEvalCallback(
+                self.config.n_rounds, arguments.eval_freq, arguments.eval_episodes, folder / EVALUATIONS
+            )
+        try:
+            model.pretrain(progress_bar=arguments.progress)
+        except ValueError as error:
+            raise OfflineStageError(str(error)) from error
+        self._costs.pretraining_seconds = self._costs.total_seconds
+        checkpoint = CheckpointCallback(folder / CHECKPOINTS, arguments.save_freq) if arguments.save_freq else None
+        recorders = [self._evaluation, self._costs, self._deployed]
+        callbacks = [*recorders, *self._monitoring(), checkpoint, StopCallback(signals, checkpoint)]
+        model.learn(
+            self.config.n_rounds * model.rollout_size * model.n_participants - model.num_timesteps,
+            [callback for callback in callbacks if callback is not None],
+            reset_num_timesteps=model.round == 0,
+            progress_bar=arguments.progress,
+        )
+
+    def _monitoring(self) -> list[RoundCallback]:
+        from sb3_fedguide.cli.schema import all_names
+        from sb3_fedguide.monitoring.callbacks import TensorBoardCallback
+        from sb3_fedguide.monitoring.diagnostics import DiagnosticsCallback
+
+        shown = {"algo": self.arguments.algo, "family": self.family.name, "seed": self.model.seed, **self.config.values}
+        pictures = TensorBoardCallback(self.config.n_rounds, self.arguments.picture_freq, shown, all_names())
+        return [DiagnosticsCallback(self._evaluation if self.arguments.eval_average else None), pictures]
+
+    def _summary(self) -> dict[str, Any]:
+        from sb3_fedguide.cli.report import summarize
+
+        return summarize(
+            self.model,
+            self._costs,
+            self._evaluation,
+            self._costs.pretraining_seconds,
+            self._costs.total_seconds,
+            algo=self.arguments.algo,
+            env=self.family.name,
+            conf_file=self.arguments.conf_file,
+            metadata_hash=self.family.content_hash,
+            n_rounds=self.config.n_rounds,
+        )
+
+
+def forget_later_events(output: TensorBoardOutputFormat, timesteps: int) -> None:
+    """Tell TensorBoard that a run goes on from ``timesteps``: what its earlier files hold of later steps is hidden."""
+    from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+    start = Event(step=timesteps + 1, session_log=SessionLog(status=SessionLog.START))
+    output.writer._get_file_writer().add_event(start)
+
+
+class OfflineStageError(Exception):
+    """Something in the offline stage that the user can put right, such as a dataset that cannot be read."""
+
+
+def one_message(error: Exception) -> str:
+    """An error's message with its lines indented below the first."""
+    return "\n  ".join(str(error).splitlines())

@@ -1,0 +1,50 @@
+"""What a run does when it is told to stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from types import FrameType, TracebackType
+from typing import Any
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopSignals:
+    """While it is entered, SIGINT and SIGTERM end the training after the running round; a second one ends it at once.
+
+    At once means ``KeyboardInterrupt``, as does the first one while :attr:`can_wait` is false: before the first round there
+    is nothing to wait for. A signal that the process ignores stays ignored.
+    """
+
+    def __init__(self) -> None:
+        #: the first signal that came
+        self.received: int | None = None
+        #: whether rounds are running whose end somebody looks for :attr:`received`
+        self.can_wait = False
+        self._earlier: dict[int, Any] = {}
+
+    @property
+    def exit_code(self) -> int:
+        """As shells report it: 130 for SIGINT, 143 for SIGTERM."""
+        return 128 + (self.received or signal.SIGINT)
+
+    def __enter__(self) -> StopSignals:
+        if threading.current_thread() is threading.main_thread():
+            for number in SIGNALS:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    self._earlier[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        for number, handler in self._earlier.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        again = self.received is not None
+        self.received = self.received or number
+        if again or not self.can_wait:
+            raise KeyboardInterrupt
+        # A handler may interrupt a print, so it does not print itself.
+        os.write(2, b"\nstopping after this round; once more to stop at once\n")

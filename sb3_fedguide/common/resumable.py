@@ -1,0 +1,194 @@
+"""All that a federation remembers between two rounds, as plain data: what a checkpoint is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from fed_envs import FederatedVecEnv
+from fed_envs.state import State, declared_state, freeze, load_declared, thaw
+from sb3_fedguide.common.array_files import array_mismatches
+from sb3_fedguide.common.callbacks import RoundCallback
+from sb3_fedguide.common.checkpoint import CheckpointError, newest_checkpoint
+from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.server.strategy import Strategy
+
+SelfResumable = TypeVar("SelfResumable", bound="Resumable")
+
+
+class Resumable(BaseAlgorithm):
+    """Mixin of a federation that gives and takes its state between two rounds.
+
+    A new object with the same settings that takes the state goes on bit for bit like the one that gave it. What an
+    algorithm adds to the state is either named in its own ``state_attributes`` or given by :meth:`save_state`.
+    """
+
+    #: attributes that change while it trains and are plain data (see :func:`fed_envs.state.freeze`); those of the base
+    #: classes are added
+    state_attributes: ClassVar[tuple[str, ...]] = (
+        "seed", "num_timesteps", "round", "_n_updates", "_episode_num", "_current_progress_remaining", "pretrained",
+        "pretraining_bytes", "present", "outdated", "episode_infos", "_streams", "_last_obs", "_last_episode_starts",
+    )  # fmt: skip
+    normalizer: FederatedNormalizer
+    strategy: Strategy | None
+    client_ids: list[int]
+    n_envs_per_client: int
+    rollout_size: int
+    family: Any
+    #: of the run that is resumed, until its callbacks are there
+    _callback_states: Sequence[State] = ()
+
+    def _optimizers(self) -> list[th.optim.Optimizer]:
+        raise NotImplementedError
+
+    def _identity(self) -> dict[str, Any]:
+        """What has to be the same where a state is taken."""
+        return {
+            "algorithm": type(self).__name__,
+            "family": None if self.family is None else self.family.content_hash,
+            "clients": list(self.client_ids),
+            "n_envs_per_client": self.n_envs_per_client,
+            "rollout_size": self.rollout_size,
+        }
+
+    def save_state(self) -> State:
+        """Policies, optimisers, server, normalisation, random streams, environments and counters; only between two rounds.
+
+        :raises ValueError: where something cannot be part of it, with the remedy
+        """
+        state: State = {
+            "identity": self._identity(),
+            "attributes": declared_state(self),
+            "policy": to_arrays(self.policy.state_dict()),
+            "optimizers": [_optimizer_state(optimizer) for optimizer in self._optimizers()],
+            "normalizer": to_arrays(self.normalizer.state_dict()),
+            "strategy": None if self.strategy is None else self.strategy.save_state(),
+            "env": self._federated_env().save_state(),
+            # Nothing here draws from the processes' own generators; a user's environment or algorithm may.
+            "random": {"torch": th.get_rng_state().numpy().copy(), "numpy": freeze(np.random.get_state())},
+        }
+        forgotten = self._forgotten(state["attributes"])
+        if forgotten:
+            raise ValueError(
+                f"{type(self).__name__} keeps arrays in {', '.join(forgotten)}, which no checkpoint would hold: name them in "
+                "its state_attributes, or in _excluded_save_params() if every round makes them anew"
+            )
+        return state
+
+    def load_state(self, state: State) -> None:
+        """Take what :meth:`save_state` returned; ``learn(remaining_timesteps, reset_num_timesteps=False)`` then goes on.
+
+        :raises ValueError: for the state of another algorithm, other clients or other sizes
+        """
+        for name, own in self._identity().items():
+            if state["identity"].get(name) != own:
+                raise ValueError(f"the state does not fit: its {name} is {state['identity'].get(name)!r}, here it is {own!r}")
+        mismatches = array_mismatches(state["policy"], to_arrays(self.policy.state_dict()))
+        if mismatches:
+            raise ValueError(f"the state's policies do not fit: {mismatches[0]}")
+        load_declared(self, state["attributes"])
+        self.policy.load_state_dict(to_tensors(state["policy"]))
+        for optimizer, saved in zip(self._optimizers(), state["optimizers"], strict=True):
+            _load_optimizer(optimizer, saved)
+        self.normalizer.load_state_dict(to_tensors(state["normalizer"]))
+        if self.strategy is not None:
+            self.strategy.load_state(state["strategy"])
+        self._federated_env().load_state(state["env"])
+        th.set_rng_state(th.from_numpy(state["random"]["torch"].copy()))
+        np.random.set_state(thaw(state["random"]["numpy"]))
+
+    def resume(self: SelfResumable, folder: str | Path) -> SelfResumable:
+        """Take the newest intact checkpoint that a :class:`CheckpointCallback` wrote to ``folder``.
+
+        The next ``learn(remaining_timesteps, callbacks, reset_num_timesteps=False)`` goes on from there, with callbacks of
+        the same kinds as in the run that wrote it.
+
+        :raises ValueError: if there is none, none is intact, or it does not fit
+        """
+        found = newest_checkpoint(folder)
+        if found is None:
+            raise ValueError(f"there is no checkpoint in {folder}")
+        path, state = found
+        try:
+            self.load_state(state["model"])
+            self._callback_states = [*state["callbacks"]]
+        except (KeyError, TypeError, IndexError, RuntimeError, AttributeError) as error:
+            raise ValueError(f"{path} does not fit this version or algorithm: {error!r}") from error
+        return self
+
+    def _resume_callbacks(self, callbacks: Iterable[RoundCallback]) -> None:
+        """Hand the callbacks of a resumed run their part of the checkpoint, by class and order.
+
+        :raises CheckpointError: where one is missing, or its part does not fit
+        """
+        waiting = list(self._callback_states)
+        for callback in callbacks:
+            match = next((saved for saved in waiting if saved["class"] == type(callback).__name__), None)
+            if match is not None:
+                waiting.remove(match)
+                try:
+                    callback.load_state(match["state"])
+                except ValueError as error:
+                    raise CheckpointError(str(error)) from error
+        self._callback_states = ()
+        if waiting:
+            raise CheckpointError(
+                "the checkpoint holds the state of callbacks that this run has not got: "
+                f"{', '.join(saved['class'] for saved in waiting)}; give learn() the callbacks of the run that is resumed"
+            )
+
+    def _federated_env(self) -> FederatedVecEnv:
+        env = self.get_env()
+        if not isinstance(env, FederatedVecEnv):
+            raise ValueError("a federation without environments has no state to save or load; give it some with set_env()")
+        return env
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_callback_states"]
+
+    def _forgotten(self, saved: State) -> list[str]:
+        """Attributes with arrays that are neither saved nor said to be transient."""
+        transient = set(self._excluded_save_params())
+        return [
+            name for name, value in vars(self).items() if name not in saved and name not in transient and _holds_arrays(value)
+        ]
+
+
+def _holds_arrays(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return any(map(_holds_arrays, value.values()))
+    if isinstance(value, (list, tuple)):
+        return any(map(_holds_arrays, value))
+    return isinstance(value, (np.ndarray, th.Tensor))
+
+
+def to_arrays(tensors: Mapping[str, th.Tensor]) -> dict[str, np.ndarray]:
+    """Copies of named tensors as arrays."""
+    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in tensors.items()}
+
+
+def to_tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, th.Tensor]:
+    """Copies of named arrays as tensors."""
+    return {name: th.from_numpy(array.copy()) for name, array in arrays.items()}
+
+
+def _optimizer_state(optimizer: th.optim.Optimizer) -> State:
+    """Moments and step counts of each parameter in the optimiser's order, and the groups' learning rates."""
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    return {
+        "parameters": [to_arrays(optimizer.state.get(parameter, {})) for parameter in parameters],
+        "learning_rates": [float(group["lr"]) for group in optimizer.param_groups],
+    }
+
+
+def _load_optimizer(optimizer: th.optim.Optimizer, saved: State) -> None:
+    state = optimizer.state_dict()
+    state["state"] = {index: to_tensors(arrays) for index, arrays in enumerate(saved["parameters"]) if arrays}
+    for group, learning_rate in zip(state["param_groups"], saved["learning_rates"], strict=True):
+        group["lr"] = learning_rate
+    optimizer.load_state_dict(state)

@@ -1,0 +1,144 @@
+"""Checks of what clients upload, before any of it moves the others: form, finiteness, and norms beside the others' norms."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+
+import numpy as np
+
+from sb3_fedguide.server.payload import N_SAMPLES, Payload
+
+#: An upload's arrays as names with shapes, in the order of names.
+Form = tuple[tuple[str, tuple[int, ...]], ...]
+
+#: Name of the group of every array that no prefix puts elsewhere.
+PARAMETERS = "parameters"
+
+#: Below so many uploads there is no majority that could tell an outlier.
+FEWEST_NORMS = 3
+
+#: Default bound on norms: honest clients of every algorithm stay below half of it.
+UPLOAD_BOUND = 10.0
+
+
+def check_uploads(
+    uploads: Mapping[int, Payload], sent: Mapping[int, Payload], groups: tuple[str, ...] = (), bound: float = UPLOAD_BOUND
+) -> dict[int, str]:
+    """Which uploads of an exchange are not to be used, and why.
+
+    In this order an upload has to
+
+    * be named arrays of float32, with a positive number of samples where there is one;
+    * be finite;
+    * have the names and shapes that most of the finite uploads have;
+    * have norms of at most ``median + bound * max(MAD, median / 2)`` of the positive norms of what is still left, from three
+      uploads on. MAD is their median absolute deviation. It is never above the median, so that ``bound`` allows between
+      ``1 + bound / 2`` and ``1 + bound`` times the median.
+
+    The norm of parameters is that of the client's change since what it was last sent, or, of what it was never sent, that of
+    the distance from the uploads' median. Arrays of the other groups are taken whole: a head is meant to differ.
+
+    An upload that is wrong in its direction only passes: a norm does not see it.
+
+    :param uploads: payload by client id
+    :param sent: what each client was last sent
+    :param groups: names that begin with the same one of these have a norm of their own; all others are parameters, and have
+        one together
+    :param bound: see above
+    :return: the reason by client for every upload that is to be rejected
+    """
+    reasons = {client: reason for client in sorted(uploads) if (reason := broken(uploads[client]))}
+    forms = {client: form(uploads[client]) for client in sorted(uploads) if client not in reasons}
+    if not forms:
+        return reasons
+    usual = Counter(forms.values()).most_common(1)[0][0]
+    reasons |= {client: _difference(own, usual) for client, own in forms.items() if own != usual}
+    left = [client for client in forms if client not in reasons]
+    if len(left) >= FEWEST_NORMS:
+        apart, shapes = (*groups, N_SAMPLES), dict(usual)
+        known = {
+            client: {name: array for name, array in sent.get(client, {}).items() if shapes.get(name) == np.shape(array)}
+            for client in left
+        }
+        new = [name for name, _ in usual if not name.startswith(apart) and any(name not in own for own in known.values())]
+        medians = {name: np.median(np.stack([uploads[client][name] for client in left]), axis=0) for name in new}
+        norms = {client: group_norms(uploads[client], {**medians, **known[client]}, apart) for client in left}
+        reasons |= _outliers(norms, bound)
+    return reasons
+
+
+def group_norms(upload: Payload, reference: Payload, groups: tuple[str, ...]) -> dict[str, float]:
+    """Norm of each group of an upload's arrays, and of its parameters less the reference."""
+    squares: dict[str, float] = {}
+    for name, array in upload.items():
+        values = np.asarray(array, dtype=np.float64)
+        group = next((prefix for prefix in groups if name.startswith(prefix)), PARAMETERS)
+        if group == PARAMETERS:
+            values = values - reference[name]
+        squares[group] = squares.get(group, 0.0) + float(np.sum(values**2))
+    return {group: math.sqrt(square) for group, square in squares.items()}
+
+
+def _outliers(norms: Mapping[int, Mapping[str, float]], bound: float) -> dict[int, str]:
+    reasons: dict[int, str] = {}
+    for group in next(iter(norms.values())):
+        limit = norm_limit([own[group] for own in norms.values()], bound)
+        for client, own in norms.items():
+            if own[group] > limit:
+                label = group.rstrip(".")
+                reasons.setdefault(client, f"the norm of its {label} is {own[group]:.3g}, over the limit of {limit:.3g}")
+    return reasons
+
+
+def norm_limit(norms: list[float], bound: float) -> float:
+    """``median + bound * max(MAD, median / 2)`` of the positive norms; infinite where none is positive."""
+    # Clients that have not learned yet change nothing, and must not make outliers of those that have.
+    positive = np.array([norm for norm in norms if norm > 0])
+    if not len(positive):
+        return math.inf
+    median = float(np.median(positive))
+    return median + bound * max(float(np.median(np.abs(positive - median))), median / 2)
+
+
+def broken(upload: Payload) -> str | None:
+    """What is wrong with an upload by itself, if anything."""
+    if not isinstance(upload, Mapping):
+        return f"it is a {type(upload).__name__}, not named arrays"
+    for name, array in upload.items():
+        if not isinstance(name, str):
+            return f"the name {name!r} is not a string"
+        if not isinstance(array, np.ndarray | np.generic):
+            return f"{name} is a {type(array).__name__}, not an array"
+        if array.dtype != np.float32:
+            return f"{name} has the type {array.dtype}, not float32"
+        if not np.isfinite(array).all():
+            return f"{name} has values that are not finite"
+    if N_SAMPLES in upload and not (np.ndim(upload[N_SAMPLES]) == 0 and upload[N_SAMPLES] > 0):
+        return f"{N_SAMPLES} is not a positive number"
+    return None
+
+
+def form(upload: Payload) -> Form:
+    """Names and shapes of an upload."""
+    return tuple(sorted((name, np.shape(array)) for name, array in upload.items()))
+
+
+def _difference(own: Form, usual: Form) -> str:
+    mine, theirs = dict(own), dict(usual)
+    for name in theirs:
+        if name not in mine:
+            return f"{name} is missing"
+        if mine[name] != theirs[name]:
+            return f"{name} has the shape {mine[name]}, those of the others {theirs[name]}"
+    return f"{next(name for name in mine if name not in theirs)} is not expected"
+
+
+def check_bound(bound: float | None) -> None:
+    """:raises ValueError: for a bound that is not positive"""
+    if bound is not None and not 0 < bound < math.inf:
+        raise ValueError(
+            f"upload_bound={bound} must be positive: it says how far norms of uploads may exceed the clients' median; "
+            "None leaves out all checks of uploads"
+        )
