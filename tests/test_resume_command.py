@@ -99,6 +99,7 @@ def survive(driver: Driver, algo: str, env: str, tmp_path: Path, kills: list[lis
     :return: how many of the kills hit it while it was running
     """
     whole, parts, log = tmp_path / "whole", tmp_path / "parts", tmp_path / "log.txt"
+    tmp_path.mkdir(exist_ok=True)
     assert driver(arguments(algo, env, whole, rounds), log) == 0, log.read_text()
     folder = parts / algo / f"{env}_1"
     codes: list[int] = []
