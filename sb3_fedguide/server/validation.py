@@ -19,8 +19,8 @@ PARAMETERS = "parameters"
 #: Below so many uploads there is no majority that could tell an outlier.
 FEWEST_NORMS = 3
 
-#: Default bound on norms: honest clients of every algorithm stay below half of it.
-UPLOAD_BOUND = 10.0
+#: Default bound on norms: at 10 an honest client of FedAvg on Bandit2D was rejected (six times the median of four).
+UPLOAD_BOUND = 30.0
 
 
 def check_uploads(
