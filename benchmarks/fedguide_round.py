@@ -97,7 +97,8 @@ def main() -> None:
     errors = subsample_errors(models["snis"], args.draws)
     table = {name: spread(values) for name, values in seconds.items()}
     suffix = f"_x{args.n_envs_per_client}" if args.n_envs_per_client > 1 else ""
-    result = {"command": vars(args), "seconds": table, "ratio_to_local": ratios, "snis_gradient": errors}
+    command = {name: value for name, value in vars(args).items() if name != "cache_dir"}  # says nothing of the figures
+    result = {"command": command, "seconds": table, "ratio_to_local": ratios, "snis_gradient": errors}
     write_result(f"fedguide_round_{args.env}{suffix}", result)
     for name, values in table.items():
         print(f"{name:8} {values['median']:6.2f} s a round ({values['min']:.2f} to {values['max']:.2f})")

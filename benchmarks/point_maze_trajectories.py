@@ -11,7 +11,6 @@ after local training. Titles have the mean return and the share of episodes that
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,10 +24,8 @@ from matplotlib.figure import Figure
 from fed_envs import Family, FederatedVecEnv
 from fed_envs.clients import PointMazeClient
 from fed_envs.mazes import WALL, maze_rows
-from fed_envs.metadata import read_family
 from fed_envs.point_maze import SUCCESS_DISTANCE
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
-from sb3_fedguide.cli.run_folder import read_deployed
+from sb3_fedguide.cli import saved_run
 from sb3_fedguide.common.seeding import EVALUATION_SEED, Role
 
 COLORS = ("#2e86ab", "#d1495b", "#3a7d44", "#8e5ea2", "#d98c21", "#777777")
@@ -57,19 +54,13 @@ def read_run(folder: Path) -> tuple[str, Family, Any]:
 
     :raises ValueError: if the folder is none of a finished run on a PointMaze family
     """
-    for name in ("model.zip", "summary.json", "metadata.json"):
-        if not (folder / name).is_file():
-            raise ValueError(f"{folder} is not the folder of a finished run: it has no {name}")
-    family = read_family(folder / "metadata.json")
+    summary, config, family = saved_run.read_run(folder)
     if family.world != "point_maze":
         raise ValueError(f"{folder} is a run on {family.name}; only PointMaze families have mazes to draw")
-    method = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["algo"]
-    if method not in ALGORITHMS:
-        raise ValueError(f"{folder}: unknown algorithm {method!r}; known are {', '.join(ALGORITHMS)}")
-    model = algorithm(method).load(folder / "model.zip", env=FederatedVecEnv(family), device="cpu")  # type: ignore[attr-defined]
-    deployed = {name: th.as_tensor(array) for name, array in read_deployed(folder).items()}
+    model = saved_run.load_model(folder, config, family)
+    deployed = {name: th.as_tensor(array) for name, array in saved_run.read_deployed_policies(folder, model).items()}
     model.policy.load_state_dict({**model.policy.state_dict(), **deployed})
-    return method, family, model
+    return summary["algo"], family, model
 
 
 def roll_out(method: str, family: Family, model: Any, n_episodes: int, seed: int) -> Episodes:

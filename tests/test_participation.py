@@ -137,6 +137,24 @@ def test_who_missed_an_average_receives_it_before_training_again(point_envs):
     assert late > 0
 
 
+def test_who_was_away_between_two_averages_keeps_what_it_learned_since_the_last(point_envs):
+    """Averages follow every fifth round; only who missed one of these has something to catch up with."""
+    model, watch = FedAvg("MlpPolicy", point_envs(4), average_every=5, client_fraction=0.5, **SMALL), Watch()
+    model.learn(steps(model, 16), watch)
+    n_parameters, kept = len(list(model.policy.parameters())), 0
+    for client in range(4):
+        missed, learned = False, False  # an average, and something of its own since the last one
+        for round in range(16):
+            if watch.present[round][client]:
+                unchanged = equal(watch.before[round][client][:n_parameters], watch.after[round - 1][client][:n_parameters])
+                assert round == 0 or missed or unchanged
+                kept += round > 5 and not watch.present[round - 1][client] and learned and not missed
+                missed, learned = False, (round + 1) % 5 != 0
+            else:
+                missed |= (round + 1) % 5 == 0
+    assert kept
+
+
 def test_fedguide_keeps_the_rows_of_absent_clients_and_goes_on(tmp_path):
     model = FedGuide(
         "MlpPolicy", "Bandit2D", client_fraction=0.5, adapt="advantage", pretraining=TINY_OFFLINE, cache_dir=tmp_path,

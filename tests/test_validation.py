@@ -183,6 +183,20 @@ def test_who_is_rejected_in_the_setup_begins_with_the_experts_and_equal_weights(
     assert 4 not in strategy.rows and 4 not in strategy.exchange(1, rows)
 
 
+def test_the_server_keeps_only_what_later_uploads_are_compared_with():
+    """Experts go to everybody and come back from nobody: a copy for every client would be most of the server's memory."""
+    transport, averaging = OTMoE(2), Averaging()
+    while transport.needs_setup or not transport.sent:
+        heads = {client: {HEAD: np.full((1, 3), client, dtype=np.float32)} for client in range(4)}
+        rows = (
+            {client: {COST_ROW: np.ones(2, dtype=np.float32)} for client in range(4)} if transport.experts is not None else {}
+        )
+        transport.exchange(0, {client: {**heads[client], **rows.get(client, {})} for client in range(4)})
+    assert not any(transport.sent.values())
+    averaging.exchange(1, {k: {"w": np.full(2, k, dtype=np.float32), N_SAMPLES: np.float32(1)} for k in range(4)})
+    assert [list(payload) for payload in averaging.sent.values()] == [["w"]] * 4
+
+
 @pytest.mark.parametrize("n", [1, 2, 5, 8])
 def test_aggregators_against_their_definitions(n):
     rng = np.random.default_rng(n)

@@ -8,6 +8,7 @@ from sb3_fedguide.common.arguments import FederatedPPOArguments
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.parameter_averaging import ParameterAveraging
+from sb3_fedguide.server.averaging import Aggregator
 
 
 class FedAvg(ParameterAveraging, FederatedPPO):
@@ -32,7 +33,7 @@ class FedAvg(ParameterAveraging, FederatedPPO):
         average: Literal["all", "actor", "critic"] = "all",
         average_every: int = 1,
         average_until: int | None = None,
-        aggregator: Literal["mean", "median", "trimmed_mean"] = "mean",
+        aggregator: Aggregator = "mean",
         trim_fraction: float = 0.25,
         **ppo: Unpack[FederatedPPOArguments],
     ) -> None:

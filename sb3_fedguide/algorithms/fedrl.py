@@ -10,6 +10,7 @@ from sb3_fedguide.common.arguments import FederatedDDPGArguments
 from sb3_fedguide.common.federated_ddpg import FederatedDDPG
 from sb3_fedguide.common.federation import FederationLike
 from sb3_fedguide.common.parameter_averaging import ParameterAveraging
+from sb3_fedguide.server.averaging import Aggregator
 from sb3_fedguide.server.strategy import Payload
 
 
@@ -37,7 +38,7 @@ class FedRL(ParameterAveraging, FederatedDDPG):
         average: Literal["all", "actor", "critic"] = "all",
         average_every: int = 1,
         average_until: int | None = None,
-        aggregator: Literal["mean", "median", "trimmed_mean"] = "mean",
+        aggregator: Aggregator = "mean",
         trim_fraction: float = 0.25,
         **ddpg: Unpack[FederatedDDPGArguments],
     ) -> None:

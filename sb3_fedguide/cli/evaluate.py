@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import OneLineParser
+from sb3_fedguide.cli.saved_run import load_model, read_run
 from sb3_fedguide.cli.train import import_packages
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
     from fed_envs import Family
-    from sb3_fedguide.cli.config import Config
     from sb3_fedguide.common.evaluation import Evaluation
     from sb3_fedguide.common.federation import Federation
 
@@ -38,8 +37,8 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide evaluate") -> 
     try:
         import_packages(arguments.gym_packages)
         _check(arguments)
-        run, config, family = _read_run(Path(arguments.run))
-        model = _load(Path(arguments.run), config, family)
+        run, config, family = read_run(Path(arguments.run))
+        model = load_model(Path(arguments.run), config, family)
         policies = _policies(arguments, Path(arguments.run), model)
         if arguments.video is not None:
             _check_rendering(family)
@@ -89,70 +88,14 @@ def _check(arguments: argparse.Namespace) -> None:
         check_log_folder(Path(arguments.video))
 
 
-def _read_run(folder: Path) -> tuple[dict[str, Any], Config, Family]:
-    """``summary.json``, the hyperparameters and the family of a run folder.
-
-    :raises ValueError: if the folder is none of a run that was trained
-    """
-    from sb3_fedguide.cli.resume import read_settings
-    from sb3_fedguide.cli.run_folder import PARAMETERS
-
-    for name in ("summary.json", "metadata.json", "config.yml", PARAMETERS):
-        if not (folder / name).is_file():
-            raise ValueError(f"{folder} is not the folder of a trained run: it has no {name}{_remedy(folder, name)}")
-    try:
-        run = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    except (ValueError, RecursionError, OSError) as error:
-        raise ValueError(f"{folder / 'summary.json'} is not valid JSON: {error}") from None
-    if not isinstance(run, dict) or not {"algo", "env", "rounds_done"} <= run.keys():
-        raise ValueError(f"{folder / 'summary.json'} is not the summary of a run: it does not say algo, env and rounds_done")
-    if not isinstance(run["algo"], str) or run["algo"] not in ALGORITHMS:
-        raise ValueError(f"{folder}: unknown algorithm {run['algo']!r}; known are {', '.join(ALGORITHMS)}")
-    return run, *read_settings(folder, run["algo"])
-
-
-def _remedy(folder: Path, missing: str) -> str:
-    """What to do about the runs of earlier versions, which kept SB3's archive only."""
-    if missing != "parameters.npz" or not (folder / "model.zip").is_file():
-        return ""
-    return (
-        "; if you trust it, load its model.zip in Python, which unpickles it, and call "
-        f"export_parameters('{folder / missing}') on the model"
-    )
-
-
-def _load(folder: Path, config: Config, family: Family) -> Federation:
-    """The run's model from its settings and arrays; SB3's archive beside them, which would be unpickled, is left alone.
-
-    :raises ValueError: if the two do not belong together
-    """
-    import torch as th
-
-    from fed_envs import FederatedVecEnv
-    from sb3_fedguide.cli.run_folder import PARAMETERS
-
-    th.set_num_threads(1)
-    model = config.make(FederatedVecEnv(family), seed=0, device="cpu")
-    model.import_parameters(folder / PARAMETERS)
-    return model
-
-
 def _policies(arguments: argparse.Namespace, folder: Path, model: Federation) -> dict[str, dict[str, np.ndarray]]:
     """What to evaluate: a policy's name to the parameters to put in place of the saved model's (none for itself).
 
     :raises ValueError: if the file of deployed policies is damaged or another model's
     """
-    import numpy as np
+    from sb3_fedguide.cli.saved_run import read_deployed_policies
 
-    from sb3_fedguide.cli.run_folder import DEPLOYED, read_deployed
-    from sb3_fedguide.common.array_files import array_mismatches
-
-    deployed = read_deployed(folder)
-    own = {name: tensor.numpy() for name, tensor in model.policy.state_dict().items()}
-    if deployed and (mismatches := array_mismatches(deployed, own)):
-        raise ValueError(f"{folder / DEPLOYED} does not fit the run's policies: {mismatches[0]}")
-    if broken := [name for name, array in deployed.items() if not np.isfinite(array).all()]:
-        raise ValueError(f"{folder / DEPLOYED}: {broken[0]} has non-finite entries")
+    deployed = read_deployed_policies(folder, model)
     if not deployed:  # the exchange did not touch the policies: there is one of each client, and it is deployed
         if arguments.policy == "broadcast":
             raise ValueError("this method sends its clients no policies, so there is no broadcast one; leave --policy out")

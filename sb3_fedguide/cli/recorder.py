@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sb3_fedguide.cli.signals import StopSignals
+from sb3_fedguide.common.array_files import to_arrays
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.evaluation import Evaluation, FederatedEvalCallback
@@ -70,11 +71,11 @@ class DeployedCallback(RoundCallback):
         self._state: dict[str, np.ndarray] = {}
 
     def _on_local_training_end(self) -> None:
-        self._state = _arrays(self.model)
+        self._state = to_arrays(self.model.policy.state_dict())
 
     def replaced(self) -> dict[str, np.ndarray]:
         """The deployed policies' parameters where they differ from the model's own, else nothing."""
-        now = _arrays(self.model)
+        now = to_arrays(self.model.policy.state_dict())
         same = all(np.array_equal(array, now[name]) for name, array in self._state.items())
         return {} if same else self._state
 
@@ -98,10 +99,6 @@ class StopCallback(RoundCallback):
 
     def _on_training_end(self) -> None:
         self._signals.can_wait = False
-
-
-def _arrays(model: Any) -> dict[str, np.ndarray]:
-    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in model.policy.state_dict().items()}
 
 
 class RunEvalCallback(FederatedEvalCallback):

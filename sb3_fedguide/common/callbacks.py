@@ -120,8 +120,8 @@ class ExchangeCallback(RoundCallback):
         for client, reason in strategy.rejected.items():
             warnings.warn(f"round {model.round}: the server rejects the upload of client {client}: {reason}", stacklevel=1)
             model.record_client(client, "rejected", 1.0)
-        model.outdated |= ~model.present
-        if any(broadcasts.values()):  # what the others received is what a rejected one has missed
+        if any(broadcasts.values()):  # what the others received is what the absent and the rejected have missed
+            model.outdated |= ~model.present
             model.outdated[[present[client] for client in strategy.rejected]] = True
         up, down = payload_bytes(uploads), payload_bytes(broadcasts)
         self.bytes_up += up

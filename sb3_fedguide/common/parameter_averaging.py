@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from sb3_fedguide.common.federation import Federation
-from sb3_fedguide.server.averaging import Averaging, averaging_is_due, check_aggregator
+from sb3_fedguide.server.averaging import Aggregator, Averaging, averaging_is_due, check_aggregator
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload, Strategy
 
 AVERAGE_CHOICES = ("all", "actor", "critic")
@@ -21,7 +21,7 @@ class ParameterAveraging(Federation):
         average: Literal["all", "actor", "critic"],
         average_every: int,
         average_until: int | None,
-        aggregator: Literal["mean", "median", "trimmed_mean"],
+        aggregator: Aggregator,
         trim_fraction: float,
     ) -> None:
         """Called by a subclass's constructor, before its base's."""
@@ -30,7 +30,7 @@ class ParameterAveraging(Federation):
         if average_every < 1:
             raise ValueError(f"average_every={average_every} must be at least 1 round")
         check_aggregator(aggregator, trim_fraction)
-        self.aggregator: Literal["mean", "median", "trimmed_mean"] = aggregator
+        self.aggregator = aggregator
         self.trim_fraction = trim_fraction
         self.average: Literal["all", "actor", "critic"] = average
         self.average_every = average_every

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fed_envs.files import atomic_file
-from sb3_fedguide.common.array_files import array_mismatches, read_arrays, write_arrays
+from sb3_fedguide.common.array_files import array_mismatches, read_arrays, to_arrays, to_tensors, write_arrays
 from sb3_fedguide.common.normalization import FederatedNormalizer
 
 FORMAT, VERSION = "sb3_fedguide parameters", 1
@@ -81,16 +80,15 @@ class ParameterFiles(BaseAlgorithm):
 
     def parameter_arrays(self) -> dict[str, np.ndarray]:
         """Copies of everything learned, by name."""
-        policy = {f"policy/{name}": tensor.cpu().numpy().copy() for name, tensor in self.policy.state_dict().items()}
-        statistics = {f"normalizer/{name}": tensor.numpy() for name, tensor in self.normalizer.state_dict().items()}
+        policy = to_arrays(self.policy.state_dict(), "policy/")
+        statistics = to_arrays(self.normalizer.state_dict(), "normalizer/")
         del statistics["normalizer/returns"]  # of unfinished episodes
         return {**policy, **statistics}
 
     def set_parameter_arrays(self, arrays: dict[str, np.ndarray]) -> None:
         """Take arrays named as in :meth:`parameter_arrays`, which fit."""
-        self.policy.load_state_dict({name: th.as_tensor(array) for name, array in take_prefix(arrays, "policy/").items()})
-        statistics = {name: th.as_tensor(array) for name, array in take_prefix(arrays, "normalizer/").items()}
-        self.normalizer.load_state_dict(statistics, strict=False)
+        self.policy.load_state_dict(to_tensors(take_prefix(arrays, "policy/")))
+        self.normalizer.load_state_dict(to_tensors(take_prefix(arrays, "normalizer/")), strict=False)
 
 
 def _write(model: ParameterFiles, path: str | Path) -> None:

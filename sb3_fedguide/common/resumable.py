@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -12,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fed_envs import FederatedVecEnv
 from fed_envs.state import State, declared_state, freeze, load_declared, thaw
-from sb3_fedguide.common.array_files import array_mismatches
+from sb3_fedguide.common.array_files import array_mismatches, to_arrays, to_tensors
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointError, newest_checkpoint
 from sb3_fedguide.common.normalization import FederatedNormalizer
@@ -43,8 +44,9 @@ class Resumable(BaseAlgorithm):
     #: of the run that is resumed, until its callbacks are there
     _callback_states: Sequence[State] = ()
 
+    @abstractmethod
     def _optimizers(self) -> list[th.optim.Optimizer]:
-        raise NotImplementedError
+        """Everything that steps parameters."""
 
     def _identity(self) -> dict[str, Any]:
         """What has to be the same where a state is taken."""
@@ -165,16 +167,6 @@ def _holds_arrays(value: Any) -> bool:
     if isinstance(value, (list, tuple)):
         return any(map(_holds_arrays, value))
     return isinstance(value, (np.ndarray, th.Tensor))
-
-
-def to_arrays(tensors: Mapping[str, th.Tensor]) -> dict[str, np.ndarray]:
-    """Copies of named tensors as arrays."""
-    return {name: tensor.detach().cpu().numpy().copy() for name, tensor in tensors.items()}
-
-
-def to_tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, th.Tensor]:
-    """Copies of named arrays as tensors."""
-    return {name: th.from_numpy(array.copy()) for name, array in arrays.items()}
 
 
 def _optimizer_state(optimizer: th.optim.Optimizer) -> State:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch as th
 
+from sb3_fedguide.common.array_files import to_arrays, to_tensors
 from sb3_fedguide.common.parameters import take_prefix
 from sb3_fedguide.offline.dice import DiceValue
 from sb3_fedguide.offline.pretraining import untrained_prior
@@ -74,7 +74,7 @@ def part_arrays(model: FedGuide) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {}
     parts = held_parts(model)
     if model.prior is not None:
-        arrays |= {f"prior/trunk/{name}": tensor.cpu().numpy().copy() for name, tensor in model.prior.state_dict().items()}
+        arrays |= to_arrays(model.prior.state_dict(), "prior/trunk/")
         arrays |= {"prior/heads": model.heads.copy(), "prior/moments": model.score_moments.copy()}
     if model.adaptation is not None:
         arrays["prior/gram"] = np.stack([statistics.gram for statistics in model.adaptation.offline])
@@ -82,7 +82,7 @@ def part_arrays(model: FedGuide) -> dict[str, np.ndarray]:
     if model.experts is not None and "experts" in parts:
         arrays |= {"prior/experts": model.experts.copy(), "prior/mixture_rows": model.mixture_rows.copy()}
     if model.dice is not None:
-        arrays |= {f"dice/{name}": tensor.cpu().numpy().copy() for name, tensor in model.dice.state_dict().items()}
+        arrays |= to_arrays(model.dice.state_dict(), "dice/")
     if model.dice_scale is not None:
         arrays |= {"dice_scale": model.dice_scale.copy(), "dice_calibrated": model.calibrated.copy()}
     return arrays
@@ -91,7 +91,7 @@ def part_arrays(model: FedGuide) -> dict[str, np.ndarray]:
 def set_part_arrays(model: FedGuide, arrays: dict[str, np.ndarray]) -> None:
     """Fill parts that :func:`begin_parts` has set up."""
     if model.prior is not None:
-        model.prior.load_state_dict({name: th.as_tensor(array) for name, array in take_prefix(arrays, "prior/trunk/").items()})
+        model.prior.load_state_dict(to_tensors(take_prefix(arrays, "prior/trunk/")))
         model.heads, model.score_moments = arrays["prior/heads"], arrays["prior/moments"]
     if model.adaptation is not None:  # per unit of weight already
         statistics = zip(arrays["prior/gram"], arrays["prior/cross"], strict=True)
@@ -100,6 +100,6 @@ def set_part_arrays(model: FedGuide, arrays: dict[str, np.ndarray]) -> None:
     if model.experts is not None:
         model.experts, model.mixture_rows = arrays["prior/experts"], arrays["prior/mixture_rows"]
     if model.dice is not None:
-        model.dice.load_state_dict({name: th.as_tensor(array) for name, array in take_prefix(arrays, "dice/").items()})
+        model.dice.load_state_dict(to_tensors(take_prefix(arrays, "dice/")))
     if model.dice_scale is not None:
         model.dice_scale, model.calibrated = arrays["dice_scale"], arrays["dice_calibrated"]

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload, Strategy
+
+#: What can take the place of the average, see :func:`combine`.
+Aggregator = Literal["mean", "median", "trimmed_mean"]
+AGGREGATORS: tuple[Aggregator, ...] = get_args(Aggregator)
 
 
 def weighted_average(uploads: Mapping[int, Payload], names: list[str]) -> Payload:
@@ -24,13 +28,10 @@ def weighted_average(uploads: Mapping[int, Payload], names: list[str]) -> Payloa
     return average
 
 
-AGGREGATORS = ("mean", "median", "trimmed_mean")
-
-
 def combine(
     uploads: Mapping[int, Payload],
     names: list[str],
-    aggregator: Literal["mean", "median", "trimmed_mean"],
+    aggregator: Aggregator,
     trim_fraction: float,
 ) -> Payload:
     """The arrays ``names`` of all clients in one: their :func:`weighted_average`, or coordinate by coordinate their median or
@@ -80,7 +81,7 @@ class Averaging(Strategy):
         prefixes: tuple[str, ...] = ("",),
         average_every: int = 1,
         average_until: int | None = None,
-        aggregator: Literal["mean", "median", "trimmed_mean"] = "mean",
+        aggregator: Aggregator = "mean",
         trim_fraction: float = 0.25,
     ) -> None:
         super().__init__()
@@ -88,7 +89,7 @@ class Averaging(Strategy):
         self.prefixes = prefixes
         self.average_every = average_every
         self.average_until = average_until
-        self.aggregator: Literal["mean", "median", "trimmed_mean"] = aggregator
+        self.aggregator = aggregator
         self.trim_fraction = trim_fraction
         self._latest: Payload = {}
 

@@ -29,8 +29,10 @@ class Strategy(ABC):
         self.upload_bound: float | None = UPLOAD_BOUND
         #: clients whose uploads the last exchange rejected, and why
         self.rejected: dict[int, str] = {}
-        #: what each client was last sent under each name
+        #: what each client was last sent of the parameters that it uploads: what its next upload is compared with
         self.sent: dict[int, Payload] = {}
+        #: names of these parameters
+        self.compared: list[str] = []
 
     @property
     def needs_setup(self) -> bool:
@@ -67,6 +69,8 @@ class Strategy(ABC):
 
                 raise ClientError(list(uploads), f"the server cannot begin, because it rejects every upload: {reasons}")
             broadcasts.update({client: self.latest(client) for client in self.rejected})
+        apart = (*self.norm_groups, N_SAMPLES)
+        self.compared = sorted({name for payload in accepted.values() for name in payload if not name.startswith(apart)})
         self._remember(broadcasts)
         if self.upload_bound is not None:
             self.metrics["rejected"] = float(len(self.rejected))
@@ -80,7 +84,8 @@ class Strategy(ABC):
 
     def _remember(self, broadcasts: Mapping[int, Payload]) -> None:
         for client, payload in broadcasts.items() if self.upload_bound is not None else ():
-            self.sent.setdefault(client, {}).update({name: array.copy() for name, array in payload.items()})
+            kept = {name: payload[name].copy() for name in self.compared if name in payload}
+            self.sent.setdefault(client, {}).update(kept)
 
     @abstractmethod
     def aggregate(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:

@@ -1,0 +1,82 @@
+"""A run that has been trained, from its folder: nothing in it is unpickled."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_fedguide.algorithms import ALGORITHMS
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from fed_envs import Family
+    from sb3_fedguide.cli.config import Config
+    from sb3_fedguide.common.federation import Federation
+
+
+def read_run(folder: Path) -> tuple[dict[str, Any], Config, Family]:
+    """``summary.json``, the hyperparameters and the family of a run folder.
+
+    :raises ValueError: if the folder is none of a run that was trained
+    """
+    from sb3_fedguide.cli.resume import read_settings
+    from sb3_fedguide.cli.run_folder import PARAMETERS
+
+    for name in ("summary.json", "metadata.json", "config.yml", PARAMETERS):
+        if not (folder / name).is_file():
+            raise ValueError(f"{folder} is not the folder of a trained run: it has no {name}{_remedy(folder, name)}")
+    try:
+        run = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except (ValueError, RecursionError, OSError) as error:
+        raise ValueError(f"{folder / 'summary.json'} is not valid JSON: {error}") from None
+    if not isinstance(run, dict) or not {"algo", "env", "rounds_done"} <= run.keys():
+        raise ValueError(f"{folder / 'summary.json'} is not the summary of a run: it does not say algo, env and rounds_done")
+    if not isinstance(run["algo"], str) or run["algo"] not in ALGORITHMS:
+        raise ValueError(f"{folder}: unknown algorithm {run['algo']!r}; known are {', '.join(ALGORITHMS)}")
+    return run, *read_settings(folder, run["algo"])
+
+
+def _remedy(folder: Path, missing: str) -> str:
+    """What to do about the runs of earlier versions, which kept SB3's archive only."""
+    if missing != "parameters.npz" or not (folder / "model.zip").is_file():
+        return ""
+    return (
+        "; if you trust it, load its model.zip in Python, which unpickles it, and call "
+        f"export_parameters('{folder / missing}') on the model"
+    )
+
+
+def load_model(folder: Path, config: Config, family: Family) -> Federation:
+    """The run's model from its settings and arrays; SB3's archive beside them, which would be unpickled, is left alone.
+
+    :raises ValueError: if the two do not belong together
+    """
+    import torch as th
+
+    from fed_envs import FederatedVecEnv
+    from sb3_fedguide.cli.run_folder import PARAMETERS
+
+    th.set_num_threads(1)
+    model = config.make(FederatedVecEnv(family), seed=0, device="cpu")
+    model.import_parameters(folder / PARAMETERS)
+    return model
+
+
+def read_deployed_policies(folder: Path, model: Federation) -> dict[str, np.ndarray]:
+    """Parameters of the policies that the clients deploy; nothing where the saved model's own are those.
+
+    :raises ValueError: if the file is damaged or another model's
+    """
+    import numpy as np
+
+    from sb3_fedguide.cli.run_folder import DEPLOYED, read_deployed
+    from sb3_fedguide.common.array_files import array_mismatches, to_arrays
+
+    deployed = read_deployed(folder)
+    if deployed and (mismatches := array_mismatches(deployed, to_arrays(model.policy.state_dict()))):
+        raise ValueError(f"{folder / DEPLOYED} does not fit the run's policies: {mismatches[0]}")
+    if broken := [name for name, array in deployed.items() if not np.isfinite(array).all()]:
+        raise ValueError(f"{folder / DEPLOYED}: {broken[0]} has non-finite entries")
+    return deployed
