@@ -10,6 +10,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import Schedule
 
 from fed_envs.state import State
+from sb3_fedguide.algorithms.fedguide_parts import begin_parts, held_parts, part_arrays, set_part_arrays
 from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.arguments import FederatedPPOArguments
 from sb3_fedguide.common.array_files import to_arrays, to_tensors
@@ -26,7 +27,6 @@ from sb3_fedguide.priors.adaptation import HeadAdaptation
 from sb3_fedguide.priors.base import Prior, score_cost
 from sb3_fedguide.priors.importance import importance_weights
 from sb3_fedguide.priors.mixture import mixture_log_prob, mixture_sample
-from sb3_fedguide.priors.parameters import begin_parts, held_parts, part_arrays, set_part_arrays
 from sb3_fedguide.server.averaging import Averaging, averaging_is_due
 from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW, OTMoE
 from sb3_fedguide.server.strategy import Composite, Payload, Strategy
