@@ -301,8 +301,8 @@ def test_picture_of_trajectories(tmp_path, monkeypatch, capsys):
     import json
     from pathlib import Path
 
-    from sb3_fedguide.algorithms import algorithm
-    from sb3_fedguide.cli.run_folder import write_deployed
+    from sb3_fedguide.cli.config import resolve
+    from sb3_fedguide.cli.run_folder import PARAMETERS, write_deployed, write_yaml
 
     path = Path(__file__).resolve().parent.parent / "benchmarks" / "point_maze_trajectories.py"
     spec = importlib.util.spec_from_file_location("point_maze_trajectories", path)
@@ -310,16 +310,15 @@ def test_picture_of_trajectories(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, spec.name, script)
     spec.loader.exec_module(script)
     own = family({"maze": "UMaze", "goal_cells": [[1, 1]]}, {"maze": "Open", "goal_cells": [[2, 2]]}, steps=40)
-    models = [
-        algorithm("local")("MlpPolicy", FederatedVecEnv(own), rollout_size=40, batch_size=20, bc_weight=0.0, seed=seed)
-        for seed in (0, 1)
-    ]
+    config = resolve("local", own, overrides={"rollout_size": 40, "batch_size": 20, "bc_weight": 0.0})
+    models = [config.make(FederatedVecEnv(own, config.values["n_envs_per_client"]), seed=seed) for seed in (0, 1)]
     folders = [tmp_path / "first", tmp_path / "second"]
     for folder, model in zip(folders, models, strict=True):
         folder.mkdir()
-        model.save(folder / "model.zip")
+        model.export_parameters(folder / PARAMETERS)
+        write_yaml(folder / "config.yml", config.values)
         own.dump(folder / "metadata.json")
-        (folder / "summary.json").write_text(json.dumps({"algo": "local"}))
+        (folder / "summary.json").write_text(json.dumps({"algo": "local", "env": own.name, "rounds_done": 1}))
     write_deployed(folders[1], {name: tensor.numpy() for name, tensor in models[0].policy.state_dict().items()})
 
     first, second = (script.roll_out(*script.read_run(folder), n_episodes=3, seed=5) for folder in folders)
@@ -336,5 +335,5 @@ def test_picture_of_trajectories(tmp_path, monkeypatch, capsys):
     fed_envs.load_family("Reacher").dump(folders[1] / "metadata.json")
     with pytest.raises(ValueError, match="is a run on Reacher; only PointMaze families"):
         script.read_run(folders[1])
-    with pytest.raises(ValueError, match=r"has no model\.zip"):
+    with pytest.raises(ValueError, match=r"has no summary\.json"):
         script.read_run(tmp_path)

@@ -13,13 +13,13 @@ from fed_envs.state import State
 from sb3_fedguide.algorithms.fedguide_parts import begin_parts, held_parts, part_arrays, set_part_arrays
 from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.arguments import FederatedPPOArguments
-from sb3_fedguide.common.array_files import to_arrays, to_tensors
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.parameter_averaging import policy_upload
 from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES
 from sb3_fedguide.common.rollout_buffer import FederatedSamples, generalized_advantage
 from sb3_fedguide.common.seeding import Role, seed_sequence
+from sb3_fedguide.common.stacked import to_arrays, to_tensors
 from sb3_fedguide.common.value_blend import baseline_figures, optimal_blend
 from sb3_fedguide.offline.dice import DiceValue, calibrate
 from sb3_fedguide.offline.pretraining import Pretraining

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_fedguide.common.array_files import to_arrays, to_tensors
 from sb3_fedguide.common.parameters import take_prefix
+from sb3_fedguide.common.stacked import to_arrays, to_tensors
 from sb3_fedguide.offline.dice import DiceValue
 from sb3_fedguide.offline.pretraining import untrained_prior
 from sb3_fedguide.priors.adaptation import HeadAdaptation

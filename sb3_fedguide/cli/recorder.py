@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from sb3_fedguide.cli.signals import StopSignals
-from sb3_fedguide.common.array_files import to_arrays
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.evaluation import Evaluation, FederatedEvalCallback
+from sb3_fedguide.common.stacked import to_arrays
 
 TIMES = ("rollout", "train", "exchange")
 

@@ -72,7 +72,8 @@ def read_deployed_policies(folder: Path, model: Federation) -> dict[str, np.ndar
     import numpy as np
 
     from sb3_fedguide.cli.run_folder import DEPLOYED, read_deployed
-    from sb3_fedguide.common.array_files import array_mismatches, to_arrays
+    from sb3_fedguide.common.array_files import array_mismatches
+    from sb3_fedguide.common.stacked import to_arrays
 
     deployed = read_deployed(folder)
     if deployed and (mismatches := array_mismatches(deployed, to_arrays(model.policy.state_dict()))):

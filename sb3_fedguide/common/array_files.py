@@ -1,4 +1,4 @@
-"""Named arrays, of tensors for instance, in one npz file: written complete or not at all, read without pickle."""
+"""Named arrays in one npz file: written complete or not at all, read without pickle."""
 
 from __future__ import annotations
 
@@ -8,23 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import torch as th
 
 from fed_envs.files import atomic_file
 
-__all__ = ["array_mismatches", "arrays_hash", "load_arrays", "read_arrays", "to_arrays", "to_tensors", "write_arrays"]
+__all__ = ["array_mismatches", "arrays_hash", "load_arrays", "read_arrays", "write_arrays"]
 
 _CHECKSUM = "__sha256__"
-
-
-def to_arrays(tensors: Mapping[str, th.Tensor], prefix: str = "") -> dict[str, np.ndarray]:
-    """Copies of named tensors as arrays, with ``prefix`` before their names."""
-    return {prefix + name: tensor.detach().cpu().numpy().copy() for name, tensor in tensors.items()}
-
-
-def to_tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, th.Tensor]:
-    """Copies of named arrays as tensors."""
-    return {name: th.from_numpy(array.copy()) for name, array in arrays.items()}
 
 
 def arrays_hash(arrays: Mapping[str, np.ndarray]) -> str:

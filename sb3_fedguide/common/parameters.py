@@ -13,8 +13,9 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fed_envs.files import atomic_file
-from sb3_fedguide.common.array_files import array_mismatches, read_arrays, to_arrays, to_tensors, write_arrays
+from sb3_fedguide.common.array_files import array_mismatches, read_arrays, write_arrays
 from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.stacked import to_arrays, to_tensors
 
 FORMAT, VERSION = "sb3_fedguide parameters", 1
 HEADER = "header"

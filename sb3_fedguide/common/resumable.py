@@ -13,10 +13,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fed_envs import FederatedVecEnv
 from fed_envs.state import State, declared_state, freeze, load_declared, thaw
-from sb3_fedguide.common.array_files import array_mismatches, to_arrays, to_tensors
+from sb3_fedguide.common.array_files import array_mismatches
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointError, newest_checkpoint
 from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.stacked import to_arrays, to_tensors
 from sb3_fedguide.server.strategy import Strategy
 
 SelfResumable = TypeVar("SelfResumable", bound="Resumable")

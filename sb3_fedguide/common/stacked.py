@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
+import numpy as np
 import torch as th
 from torch import nn
 
@@ -90,6 +91,16 @@ def stack_tensor(tensor: th.Tensor, n_clients: int) -> th.Tensor:
 def client_state(state: Mapping[str, th.Tensor], index: int) -> dict[str, th.Tensor]:
     """Client ``index``'s part of a stacked state dict, copied: the state dict of an ordinary, unstacked network."""
     return {name: tensor[index].detach().clone() for name, tensor in state.items()}
+
+
+def to_arrays(tensors: Mapping[str, th.Tensor], prefix: str = "") -> dict[str, np.ndarray]:
+    """Copies of named tensors as arrays, with ``prefix`` before their names."""
+    return {prefix + name: tensor.detach().cpu().numpy().copy() for name, tensor in tensors.items()}
+
+
+def to_tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, th.Tensor]:
+    """Copies of named arrays as tensors."""
+    return {name: th.from_numpy(array.copy()) for name, array in arrays.items()}
 
 
 def clip_grad_norm_per_client(parameters: Sequence[th.nn.Parameter], max_norm: float) -> th.Tensor:
