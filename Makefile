@@ -5,16 +5,20 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 RUNTIME := $(VENV)/.runtime-installed
 TOOLS := $(VENV)/.tools-installed
+FLOWER := $(VENV)/.flower-installed
+RAY := $(VENV)/.ray-installed
 # Small networks gain nothing from threads, and threads of several libraries get into each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help install train demo test test-slow lint type format clean
+.PHONY: help install train demo test test-slow test-flower test-flower-slow test-ray lint type format clean
 
 help:
 	@echo "make train      install, then FedGuide on HopperHard, end to end"
 	@echo "make demo       Bandit2D in a minute: FedAvg beside FedGuide, with a picture in runs/demo"
 	@echo "make test       the test suite"
 	@echo "make test-slow  the long tests as well"
+	@echo "make test-flower test-flower-slow  deployments over Flower, with real processes; installs Flower"
+	@echo "make test-ray   training and benchmarks on two Ray nodes; installs Ray"
 	@echo "make lint type  ruff, mypy"
 	@echo "make format     rewrite the code with ruff"
 	@echo "make clean      remove caches and builds; runs, logs and the environment stay"
@@ -29,7 +33,16 @@ test: $(TOOLS)
 	$(BIN)/python -m pytest $(ARGS)
 
 test-slow: $(TOOLS)
-	$(BIN)/python -m pytest -m "slow or not slow" $(ARGS)
+	$(BIN)/python -m pytest -m "not ray and not flower and not flower_slow" $(ARGS)
+
+test-flower: $(TOOLS) $(FLOWER)
+	$(BIN)/python -m pytest -m flower $(ARGS)
+
+test-flower-slow: $(TOOLS) $(FLOWER)
+	$(BIN)/python -m pytest -m flower_slow $(ARGS)
+
+test-ray: $(TOOLS) $(RAY)
+	$(BIN)/python -m pytest -m ray $(ARGS)
 
 lint: $(TOOLS)
 	$(BIN)/python -m ruff check .
@@ -63,6 +76,14 @@ $(RUNTIME): setup.cfg pyproject.toml constraints.txt | $(BIN)/python
 
 $(TOOLS): $(RUNTIME)
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[test]'
+	@touch $@
+
+$(RAY): $(RUNTIME)
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[ray]'
+	@touch $@
+
+$(FLOWER): $(RUNTIME)
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[flower]'
 	@touch $@
 
 clean:

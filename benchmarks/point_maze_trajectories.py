@@ -81,11 +81,11 @@ def roll_out(method: str, family: Family, model: Any, n_episodes: int, seed: int
 
 
 def _maze(axes: Axes, rows: tuple[str, ...]) -> None:
+    """Walls grey, seen from above; of the border's walls a strip."""
     height, width = len(rows), len(rows[0])
     walls = np.array([[cell == WALL for cell in row] for row in rows], dtype=float)
     axes.imshow(walls, cmap="Greys", vmin=0, vmax=2, extent=(-width / 2, width / 2, -height / 2, height / 2))
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[], xlim=(0.7 - width / 2, width / 2 - 0.7), ylim=(0.7 - height / 2, height / 2 - 0.7))
 
 
 def draw(family: Family, methods: Sequence[Episodes], path: Path) -> None:
@@ -94,7 +94,7 @@ def draw(family: Family, methods: Sequence[Episodes], path: Path) -> None:
     :param methods: one row each
     :param path: a ``.png``, or any other format that matplotlib writes
     """
-    figure = Figure(figsize=(2.1 * family.n_clients + 0.4, 2.4 * len(methods)), layout="constrained")
+    figure = Figure(figsize=(1.6 * family.n_clients + 0.4, 1.8 * len(methods) + 0.4), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(methods), family.n_clients, squeeze=False)
     for number, (line, episodes) in enumerate(zip(grid, methods, strict=True)):
@@ -104,13 +104,15 @@ def draw(family: Family, methods: Sequence[Episodes], path: Path) -> None:
             assert isinstance(client, PointMazeClient)
             _maze(axes, maze_rows(client.maze))
             for one in paths:
-                axes.plot(one[:, 0], one[:, 1], color=COLORS[number % len(COLORS)], linewidth=0.9, alpha=0.8)
-            axes.plot(*paths[:, -1, :2].T, "s", color=COLORS[number % len(COLORS)], markersize=2.5)
-            axes.plot(*paths[:, 0, :2].T, "o", color="black", markersize=2.5)
-            axes.plot(*paths[:, 0, 4:].T, "*", color="#f2c14e", markeredgecolor="black", markeredgewidth=0.4, markersize=7)
+                axes.plot(one[:, 0], one[:, 1], color=COLORS[number % len(COLORS)], linewidth=1.1, alpha=0.8)
+            axes.plot(*paths[:, 0, :2].T, "o", color="black", markersize=3, label="start")
+            axes.plot(*paths[:, 0, 4:].T, "*", color="#f2c14e", markeredgecolor="black", markeredgewidth=0.4, label="goal")
+            ends = paths[~successes, -1, :2]
+            axes.plot(*ends.T, "X", color="black", markeredgecolor="white", markeredgewidth=0.5, label="end, not at the goal")
             axes.set_title(f"client {client.client}: {returns.mean():.0f}, {successes.mean():.0%}", fontsize=8)
         line[0].set_ylabel(episodes.method, fontsize=10)
-    figure.savefig(path, dpi=130)
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    figure.savefig(path, dpi=100)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -6,7 +6,7 @@
 Each repeat runs, in turn and with the same settings, one round (rollout and ``train()``, no evaluation) of
 
 * the federation,
-* the federation's clients in two federations of half of them, in two processes,
+* the same federation with its clients in two worker processes (``--engine processes``),
 * one ``stable_baselines3.PPO`` per client, one after the other,
 * the same learners spread over two processes, and
 * the federation once more, single-threaded, with a clock around every ``mj_step``: what the simulator alone takes for the
@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -34,6 +34,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fed_envs import FederatedVecEnv, load_family
 from sb3_fedguide import Local
+from sb3_fedguide.engines.processes import Processes
 
 SETTINGS: dict[str, Any] = {"learning_rate": 3e-4, "batch_size": 64, "n_epochs": 4, "policy_kwargs": {"net_arch": [64, 64]}}
 
@@ -55,10 +56,10 @@ def timed_round(learners: list[Any], timesteps: int) -> float:
     return time.perf_counter() - started
 
 
-def serve_learners(connection: Connection, make: Callable[..., list[Any]], arguments: tuple[Any, ...], timesteps: int) -> None:
-    """One process's share: a round for every message."""
+def serve_learners(connection: Connection, arguments: tuple[Any, ...], timesteps: int) -> None:
+    """One process's share of SB3's learners: a round for every message."""
     th.set_num_threads(1)
-    learners = make(*arguments)
+    learners = sb3_learners(*arguments)
     timed_round(learners, timesteps)
     connection.send("ready")
     while connection.recv():
@@ -67,19 +68,15 @@ def serve_learners(connection: Connection, make: Callable[..., list[Any]], argum
 
 
 class TwoProcesses:
-    """Learners spread over two processes, every second client in each.
+    """SB3's learners spread over two processes, every second client in each."""
 
-    :param make: ``(env, clients, rollout_size, n_envs)`` to the learners of these clients
-    """
-
-    def __init__(self, make: Callable[..., list[Any]], env: str, n_clients: int, rollout_size: int, n_envs: int) -> None:
+    def __init__(self, env: str, n_clients: int, rollout_size: int, n_envs: int) -> None:
         context = multiprocessing.get_context("spawn")
         self.ends = []
         for share in (range(0, n_clients, 2), range(1, n_clients, 2)):
             here, there = context.Pipe()
             arguments = (env, list(share), rollout_size, n_envs)
-            timesteps = rollout_size * (1 if make is sb3_learners else len(share))
-            context.Process(target=serve_learners, args=(there, make, arguments, timesteps), daemon=True).start()
+            context.Process(target=serve_learners, args=(there, arguments, rollout_size), daemon=True).start()
             self.ends.append(here)
         self._wait()
 
@@ -130,7 +127,10 @@ def measure(args: argparse.Namespace) -> dict[str, list[float]]:
     learners = sb3_learners(args.env, range(ours.n_clients), *sizes)
     timed_round([ours, alone], per_round)
     timed_round(learners, args.rollout_size)
-    theirs, halves = (TwoProcesses(make, args.env, ours.n_clients, *sizes) for make in (sb3_learners, federation))
+    theirs = TwoProcesses(args.env, ours.n_clients, *sizes)
+    (halves,), engine = federation(args.env, None, *sizes), Processes(2)
+    engine.attach(halves)
+    timed_round([halves], per_round)
     seconds: dict[str, list[float]] = {"of which train()": []}
     train = ours.train
 
@@ -143,14 +143,14 @@ def measure(args: argparse.Namespace) -> dict[str, list[float]]:
     for _ in range(args.repeats):
         for name, run in (
             ("lockstep", lambda: timed_round([ours], per_round)),
-            ("lockstep in two processes", halves.round),
+            ("lockstep in two processes", lambda: timed_round([halves], per_round)),
             ("sb3", lambda: timed_round(learners, args.rollout_size)),
             ("sb3 in two processes", theirs.round),
             ("mj_step", lambda: physics_seconds(alone, per_round)),
         ):
             seconds.setdefault(name, []).append(run())
     theirs.close()
-    halves.close()
+    engine.close()
     return seconds
 
 
@@ -173,6 +173,7 @@ def main() -> None:
             ("lockstep", "mj_step"),
             ("sb3", "lockstep in two processes"),
             ("sb3 in two processes", "lockstep in two processes"),
+            ("lockstep in two processes", "mj_step"),
         )
     }
     suffix = f"_x{args.n_envs_per_client}" if args.n_envs_per_client > 1 else ""

@@ -14,6 +14,7 @@ The import is light: the simulator, pydantic and Stable-Baselines3 are loaded wh
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from fed_envs.registration import FAMILIES, register_families, register_family, register_world
@@ -58,4 +59,5 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *_LAZY, *_SUBMODULES})
 
 
-register_families()
+if find_spec("gymnasium") is not None:  # a federation's server needs seeds and files from here, and has no environments
+    register_families()

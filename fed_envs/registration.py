@@ -8,8 +8,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
-
 if TYPE_CHECKING:
     from fed_envs.clients import Client
 
@@ -41,6 +39,8 @@ def environment_class(world: str) -> Any:
 
 def register_families() -> None:
     """Register every shipped family with Gymnasium; the second call does nothing."""
+    import gymnasium
+
     for family, path in FAMILIES.items():
         if environment_id(family) not in gymnasium.registry:
             content = json.loads(path.read_text(encoding="utf-8"))
@@ -68,6 +68,8 @@ def register_family(path: str | os.PathLike[str]) -> None:
 
     :raises ValueError: for a file that does not follow the schema, or a name that means something else already
     """
+    import gymnasium
+
     from fed_envs.metadata import read_family
 
     family, file = read_family(path), Path(path).absolute()
@@ -79,6 +81,8 @@ def register_family(path: str | os.PathLike[str]) -> None:
 
 
 def _register(family: str, world: str, max_episode_steps: int) -> None:
+    import gymnasium
+
     gymnasium.register(
         id=environment_id(family),
         entry_point=ENTRY_POINTS[world],

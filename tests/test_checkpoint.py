@@ -150,9 +150,9 @@ def test_a_crafted_file_executes_nothing(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"format": 2, "state": {}}', "format 2 and this version reads 1"),
+        ('{"format": 3, "state": {}}', "format 3 and this version reads 2"),
         ('{"state": {}}', "no checkpoint"),
-        ('{"format": 1, "state": {"x": {"__type__": "array", "name": "gone"}}}', "no checkpoint"),
+        ('{"format": 2, "state": {"x": {"__type__": "array", "name": "gone"}}}', "no checkpoint"),
         ("[1", "no checkpoint"),
         ("[]", "no checkpoint"),
         (None, "no checkpoint"),

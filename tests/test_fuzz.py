@@ -141,6 +141,15 @@ def test_params(algo, params, refuse):
     refuse(main, ["--env", "Bandit2D", "--algo", algo, "--verbose", "0", "-params", *pairs])
 
 
+@pytest.mark.parametrize(
+    "argv",
+    [["-params", "policy_kwargs.net_arch:" + "[" * 90_000], ["-params", "x" * 90_000 + ":1"], ["--device", "x" * 90_000]],
+)
+def test_a_long_value_leaves_a_message_that_can_be_read(argv, refuse):
+    error = refuse(main, ["--env", "Bandit2D", "--algo", "local", "--verbose", "0", *argv])
+    assert 0 < len(error) < 2500 and error.startswith("train.py: error: ")
+
+
 BOMB = "\n".join([f"k{i}: &a{i} [{', '.join([f'*a{i - 1}' if i else '1'] * 9)}]" for i in range(12)])
 MERGES = "a0: &a0 {x: 1, y: 2}\n" + "\n".join(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}" for i in range(1, 12))
 HOSTILE_YAML = [

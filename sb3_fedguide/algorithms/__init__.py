@@ -45,3 +45,14 @@ def algorithm(name: str) -> type[FederatedPPO] | type[FederatedDDPG]:
     """
     module, cls = ALGORITHMS[name]
     return getattr(import_module(module), cls)
+
+
+def algorithm_name(cls: type) -> str:
+    """The command-line name of an algorithm's class.
+
+    :raises ValueError: for a class that no name is registered for
+    """
+    for name, entry_point in ALGORITHMS.items():
+        if entry_point == (cls.__module__, cls.__name__):
+            return name
+    raise ValueError(f"{cls.__name__} has no name; give it one with register_algorithm()")

@@ -26,6 +26,8 @@ class FedAvg(ParameterAveraging, FederatedPPO):
     All other parameters are those of :class:`FederatedPPO`.
     """
 
+    server_method = "fedavg"
+
     def __init__(
         self,
         policy: PolicyLike,

@@ -18,7 +18,7 @@ from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.parameter_averaging import policy_upload
 from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES
 from sb3_fedguide.common.rollout_buffer import FederatedSamples, generalized_advantage
-from sb3_fedguide.common.seeding import Role, seed_sequence
+from sb3_fedguide.common.seeding import Role
 from sb3_fedguide.common.stacked import to_arrays, to_tensors
 from sb3_fedguide.common.value_blend import baseline_figures, optimal_blend
 from sb3_fedguide.offline.dice import DiceValue, calibrate
@@ -27,9 +27,9 @@ from sb3_fedguide.priors.adaptation import HeadAdaptation
 from sb3_fedguide.priors.base import Prior, score_cost
 from sb3_fedguide.priors.importance import importance_weights
 from sb3_fedguide.priors.mixture import mixture_log_prob, mixture_sample
-from sb3_fedguide.server.averaging import Averaging, averaging_is_due
-from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW, OTMoE
-from sb3_fedguide.server.strategy import Composite, Payload, Strategy
+from sb3_fedguide.server.averaging import averaging_is_due, check_averaging
+from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW
+from sb3_fedguide.server.strategy import Payload
 
 #: Raw actions further outside the action box than this get no importance weight: no behaviour data can lie there.
 ACTION_MARGIN = 0.1
@@ -70,8 +70,11 @@ class FedGuide(FederatedPPO):
     All other parameters are those of :class:`FederatedPPO`.
     """
 
+    uses_prior = True
+    server_method = "fedguide"
     uses_dice: ClassVar[bool] = True
     state_attributes = ("heads", "score_moments", "experts", "mixture_rows", "dice_scale", "calibrated")
+    shared_state = ("parts", "modules.prior")
 
     def __init__(
         self,
@@ -129,11 +132,6 @@ class FedGuide(FederatedPPO):
         self.experts: np.ndarray | None = None  # what each client last received, (n_clients, n_experts, ...)
         super().__init__(policy, env, **ppo)
 
-    def _make_strategy(self) -> Strategy:
-        assert self.seed is not None
-        n_experts = self.n_experts or self.n_clients
-        return OTMoE(n_experts, self.eta, self.cost, self.cost_scaling, seed_sequence(self.seed, Role.SERVER))
-
     def upload(self, index: int) -> Payload:
         payload: Payload = {HEAD: self.heads[index]}
         if self.cost == "score" and self.experts is not None:
@@ -148,6 +146,9 @@ class FedGuide(FederatedPPO):
         self.experts[index] = broadcast[EXPERTS]
         if MIXTURE_ROW in broadcast:
             self.mixture_rows[index] = broadcast[MIXTURE_ROW]
+
+    def upload_shapes(self) -> dict[str, list[int]]:
+        return {HEAD: list(self.offline_stage().untrained_prior().head_shape)}
 
     def _pretrain(self, stage: Pretraining) -> None:
         fitted = stage.prior()
@@ -190,9 +191,7 @@ class FedGuide(FederatedPPO):
         )
         returns = buffer.rows(monte_carlo)
         raw = buffer.rows(buffer.raw_observations)
-        if self.calibrate and self.dice_scale is None:
-            self.dice_scale = np.tile([1.0, 0.0], (self.n_clients, 1))
-            self.calibrated = np.zeros(self.n_clients, dtype=bool)
+        self._begin_calibration()
         if self.dice_scale is not None:
             for i in np.flatnonzero(self.present & ~self.calibrated).tolist():
                 deviation = self.normalizer.reward_deviation[i]
@@ -227,8 +226,17 @@ class FedGuide(FederatedPPO):
         for name, per_client in figures.items():
             self.logger.record(f"dice/{name}", float(per_client[self.present].mean()))
         for index in np.flatnonzero(self.present):
-            correlation = float(figures["residual_correlation"][index])
-            self.record_client(self.client_ids[index], "residual_correlation", correlation)
+            for name in ("residual_correlation", "explained_variance_dice"):
+                self.record_client(self.client_ids[index], name, float(figures[name][index]))
+
+    def complete_state(self) -> None:
+        super().complete_state()
+        self._begin_calibration()
+
+    def _begin_calibration(self) -> None:
+        if self.dice is not None and self.calibrate and self.dice_scale is None:
+            self.dice_scale = np.tile([1.0, 0.0], (self.n_clients, 1))
+            self.calibrated = np.zeros(self.n_clients, dtype=bool)
 
     def _dice_values(self, index: int, raw_obs: np.ndarray) -> np.ndarray:
         """V_phi of one client at raw observations ``(batch, obs_dim)``, in the scale of its rewards, ``(batch,)``."""
@@ -288,6 +296,7 @@ class FedGuide(FederatedPPO):
             drawn, size = importance_weights(log_prior - policy_log_probs[i, chosen], supported)
             weights[i, chosen] = drawn * (buffer.n_rows / n_states)
             sizes.append(size / n_states)
+            self.record_client(self.client_ids[i], "effective_sample_share", sizes[-1])
         buffer.extras["prior_weights"] = th.as_tensor(weights, device=self.device)
         self.logger.record("prior/effective_sample_share", float(np.mean(sizes)))
         self.logger.record("prior/effective_sample_share_min", float(np.min(sizes)))
@@ -362,14 +371,12 @@ class FedGuideA(FedGuide):
     All other parameters are those of :class:`FedGuide`.
     """
 
+    server_method = "fedguide-a"
+
     def __init__(self, policy: PolicyLike, env: FederationLike | None, average_every: int = 5, **fedguide: object) -> None:
-        if average_every < 1:
-            raise ValueError(f"average_every={average_every} must be at least 1 round")
+        check_averaging("actor", average_every)
         self.average_every = average_every
         super().__init__(policy, env, **fedguide)  # type: ignore[arg-type]
-
-    def _make_strategy(self) -> Strategy:
-        return Composite([super()._make_strategy(), Averaging(ACTOR_PREFIXES, self.average_every)])
 
     def sends_policy(self, round: int) -> bool:
         return averaging_is_due(round, self.average_every)
@@ -379,6 +386,10 @@ class FedGuideA(FedGuide):
         if self.sends_policy(self.round):
             payload.update(policy_upload(self, index, ACTOR_PREFIXES))
         return payload
+
+    def upload_shapes(self) -> dict[str, list[int]]:
+        actor = policy_upload(self, 0, ACTOR_PREFIXES)
+        return super().upload_shapes() | {name: list(array.shape) for name, array in actor.items()}
 
     def receive(self, index: int, broadcast: Payload) -> None:
         super().receive(index, broadcast)

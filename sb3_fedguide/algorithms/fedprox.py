@@ -31,6 +31,10 @@ class AnchoredFedAvg(FedAvg):
         for name, array in broadcast.items():
             self.anchor[name][index] = array
 
+    def complete_state(self) -> None:
+        super().complete_state()
+        self._initialize_anchor()
+
     def _prepare_training(self) -> None:
         self._initialize_anchor()
 

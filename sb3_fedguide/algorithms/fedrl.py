@@ -31,6 +31,8 @@ class FedRL(ParameterAveraging, FederatedDDPG):
     All other parameters are those of :class:`FederatedDDPG`.
     """
 
+    server_method = "fedrl"
+
     def __init__(
         self,
         policy: str | type[TD3Policy],

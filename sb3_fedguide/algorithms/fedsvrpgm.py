@@ -11,8 +11,8 @@ from sb3_fedguide.common.anchors import Parameters, actor_at, snapshot
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES, StackedActor
 from sb3_fedguide.common.rollout_buffer import FederatedSamples
-from sb3_fedguide.server.strategy import Payload, Strategy
-from sb3_fedguide.server.svrpg import DIRECTION, SVRPG
+from sb3_fedguide.server.strategy import Payload
+from sb3_fedguide.server.svrpg import DIRECTION
 
 
 class FedSVRPGM(FedAvg):
@@ -38,6 +38,7 @@ class FedSVRPGM(FedAvg):
     All other parameters are those of :class:`FedAvg`.
     """
 
+    server_method = "fedsvrpgm"
     state_attributes = ("reference", "reference_period", "momentum", "directions")
 
     def __init__(
@@ -73,9 +74,6 @@ class FedSVRPGM(FedAvg):
             self.momentum = {name: np.zeros_like(array) for name, array in snapshot(self.policy, ACTOR_PREFIXES).items()}
             self.directions = {name: array.copy() for name, array in self.momentum.items()}
 
-    def _make_strategy(self) -> Strategy:
-        return SVRPG(self.averaged_prefixes, self.average_every, self.average_until, self.aggregator, self.trim_fraction)
-
     def upload(self, index: int) -> Payload:
         """Parameters and number of samples as in FedAvg, and ``direction.<actor parameter>``."""
         payload = super().upload(index)
@@ -96,11 +94,18 @@ class FedSVRPGM(FedAvg):
         self._n_directions = 0
         self._record_ratios()
 
+    def complete_state(self) -> None:
+        super().complete_state()
+        self._begin_references()
+
+    def _begin_references(self) -> None:
+        if not self.reference:
+            self.reference, self.reference_period = snapshot(self.policy, ACTOR_PREFIXES), np.full(self.n_clients, -1)
+
     def _refresh_references(self) -> None:
         """Clients that were away when the others took a new reference take theirs when they are back."""
         current = snapshot(self.policy, ACTOR_PREFIXES)
-        if not self.reference:
-            self.reference, self.reference_period = current, np.full(self.n_clients, -1)
+        self._begin_references()
         period = self.round // self.reference_every
         due = (self.reference_period != period) | (self.round % self.reference_every == 0)
         for index in np.flatnonzero(due & self.present):

@@ -58,7 +58,15 @@ def train_parser(prog: str) -> OneLineParser:
     flag("--device", default="cpu", help="PyTorch device, e.g. cpu or cuda")
     flag("--num-threads", type=int, default=1, metavar="N", help="threads that step the simulators (PyTorch takes one: small "
          "networks gain nothing from more)")  # fmt: skip
-    flag("--verbose", type=int, default=1, choices=(0, 1, 2), help="0: nothing but errors; 1: the log of each round (not "
+    flag("--engine", default="lockstep", choices=("lockstep", "processes", "ray"), help="where the clients train: all in "
+         "this process, in processes of their own, or in Ray actors; results are the same")  # fmt: skip
+    flag("--num-actors", type=int, default=2, metavar="K", help="groups of clients that train at the same time, with "
+         "processes or ray")  # fmt: skip
+    flag("--ray-address", metavar="ADDRESS", help="a running Ray cluster, e.g. auto or 10.0.0.1:6379; otherwise "
+         "one is started")  # fmt: skip
+    flag("--delays", metavar="SPEC", help="simulate stragglers and dropouts: sync, deadline or async with settings, e.g. "
+         "async:median=60,spread=0.8,dropout=0.1,tick=30, or a YAML file of them")  # fmt: skip
+    flag("--verbose", type=int, default=1, choices=(0, 1, 2), help="0: warnings and errors only; 1: each round's log (not "
          "beside progress bars); 2: always")  # fmt: skip
     return parser
 
@@ -87,7 +95,7 @@ def _problems(arguments: Any) -> list[str]:
         found.append("give the clients' environments with --env FAMILY, or --metadata FILE")
     if arguments.n_timesteps is not None and arguments.rounds is not None:
         found.append("-n/--n-timesteps and --rounds both say how long to train; give one of them")
-    for name in ("n_timesteps", "rounds", "n_envs_per_client", "eval_freq", "eval_episodes", "num_threads"):
+    for name in ("n_timesteps", "rounds", "n_envs_per_client", "eval_freq", "eval_episodes", "num_threads", "num_actors"):
         value = getattr(arguments, name)
         if value is not None and value < 1:
             found.append(f"--{name.replace('_', '-')} must be at least 1, not {value}")
@@ -97,6 +105,8 @@ def _problems(arguments: Any) -> list[str]:
         found.append(f"--save-freq must not be negative, not {arguments.save_freq}; 0 writes no checkpoints")
     if arguments.eval_average and arguments.no_eval:
         found.append("--eval-average and --no-eval contradict each other; give one of them")
+    if arguments.ray_address is not None and arguments.engine != "ray":
+        found.append("--ray-address is for --engine ray")
     if arguments.picture_freq < 0:
         found.append(f"--picture-freq must not be negative, not {arguments.picture_freq}; 0 draws no pictures")
     if arguments.seed >= 2**31:

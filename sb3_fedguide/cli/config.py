@@ -135,7 +135,7 @@ def resolve(
     if n_timesteps is not None:
         if n_timesteps < 1:
             raise ValueError(f"n_timesteps={n_timesteps} must be at least 1; it counts the steps of all clients together")
-        from sb3_fedguide.common.participation import n_participants
+        from sb3_fedguide.server.participants import n_participants
 
         present = n_participants(values["client_fraction"], family.n_clients)
         values["n_rounds"] = -(-n_timesteps // (values["rollout_size"] * present))

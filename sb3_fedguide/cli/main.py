@@ -9,9 +9,11 @@ from sb3_fedguide.cli.names import nearest
 
 USAGE = """usage: fedguide COMMAND ...
 
-  train     train a federation (the same as train.py)
-  evaluate  evaluate a finished run's policies, client by client
-  demo      FedAvg beside FedGuide on Bandit2D, with a picture
+  train      train a federation (the same as train.py)
+  evaluate   evaluate a finished run's policies, client by client
+  benchmark  methods on families with seeds, as runs that can be interrupted, and tables of their results
+  deploy     a federation over a network: certificates, keys, server and clients
+  demo       FedAvg beside FedGuide on Bandit2D, with a picture
 
 fedguide COMMAND --help shows a command's flags"""
 
@@ -27,7 +29,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(__version__)
         return 0
-    commands: dict[str, Callable[[Sequence[str]], int]] = {"train": _train, "evaluate": _evaluate, "demo": _demo}
+    commands: dict[str, Callable[[Sequence[str]], int]] = {
+        "train": _train,
+        "evaluate": _evaluate,
+        "benchmark": _benchmark,
+        "deploy": _deploy,
+        "demo": _demo,
+    }
     if arguments[0] not in commands:
         print(f"fedguide: error: unknown command {arguments[0]!r}.{nearest(arguments[0], commands)} Known: "
               f"{', '.join(commands)}", file=sys.stderr)  # fmt: skip
@@ -43,6 +51,18 @@ def _train(argv: Sequence[str]) -> int:
 
 def _evaluate(argv: Sequence[str]) -> int:
     from sb3_fedguide.cli.evaluate import main
+
+    return main(argv)
+
+
+def _benchmark(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.benchmark import main
+
+    return main(argv)
+
+
+def _deploy(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.deploy import main
 
     return main(argv)
 

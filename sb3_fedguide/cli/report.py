@@ -44,6 +44,8 @@ def summarize(
             "median_round": statistics.median(costs.round_seconds) if costs.round_seconds else None,
         },
     }
+    if model.delays is not None:
+        result["simulated_seconds"] = model.delays.seconds
     for policy in evaluated:
         result[policy] = {
             "client_returns": [float(value) for value in evaluated[policy].client_returns],
@@ -82,11 +84,12 @@ def print_summary(summary: dict[str, Any], folder: str) -> None:
         f"{part} {seconds[part]:.0f} s" for part in ("pretraining", "rollout", "train", "exchange", "evaluation")
     )
     console.print(f"time   {seconds['total']:.0f} s ({parts})", highlight=False)
-    console.print(f"bytes  {_size(summary['bytes_up'])} up, {_size(summary['bytes_down'])} down", highlight=False)
+    console.print(f"bytes  {format_size(summary['bytes_up'])} up, {format_size(summary['bytes_down'])} down", highlight=False)
     console.print(f"folder {folder}", highlight=False, soft_wrap=True)
 
 
-def _size(n_bytes: float) -> str:
+def format_size(n_bytes: float) -> str:
+    """Bytes, readable."""
     for unit in ("B", "kB", "MB"):
         if n_bytes < 1000:
             return f"{n_bytes:.0f} {unit}" if unit == "B" else f"{n_bytes:.1f} {unit}"

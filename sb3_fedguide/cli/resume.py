@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from sb3_fedguide.cli.config import Config
 
 #: Flags that change nothing in what a run computes, so that they may differ from the run's own.
-FREE = ("verbose", "progress", "save_freq", "picture_freq", "num_threads", "cache_dir", "gym_packages", "resume")
+FREE = ("verbose", "progress", "save_freq", "picture_freq", "num_threads", "cache_dir", "gym_packages", "resume", "engine",
+        "num_actors", "ray_address")  # fmt: skip
 
 
 def given_flags(argv: Sequence[str] | None, prog: str) -> dict[str, Any]:
@@ -68,6 +69,10 @@ def _is_possible(action: argparse.Action, value: Any) -> bool:
 
 
 def _comparable(name: str, value: Any) -> Any:
+    if name == "delays" and value is not None:
+        from sb3_fedguide.cli.delays import read_delays
+
+        return str(read_delays(value))
     return str(Path(value).absolute()) if name in ("log_folder", "tensorboard_log", "metadata") and value else value
 
 

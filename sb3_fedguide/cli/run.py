@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
 EXIT_USAGE = 2
+LONGEST_MESSAGE = 2000
 
 
 class Run:
@@ -133,6 +134,7 @@ class Run:
         from sb3_fedguide.cli.recorder import CostCallback, DeployedCallback, RunEvalCallback, StopCallback
         from sb3_fedguide.cli.run_folder import CHECKPOINTS, EVALUATIONS
         from sb3_fedguide.common.checkpoint import CheckpointCallback
+        from sb3_fedguide.engines import make_engine
 
         arguments, model = self.arguments, self.model
         self._costs, self._deployed, self._evaluation = CostCallback(), DeployedCallback(), None
@@ -148,21 +150,30 @@ class Run:
         checkpoint = CheckpointCallback(folder / CHECKPOINTS, arguments.save_freq) if arguments.save_freq else None
         recorders = [self._evaluation, self._costs, self._deployed]
         callbacks = [*recorders, *self._monitoring(), checkpoint, StopCallback(signals, checkpoint)]
+        engine = make_engine(arguments.engine, arguments.num_actors, arguments.ray_address)
+        with ExitStack() as stack:
+            if engine is not None:
+                stack.enter_context(engine).attach(model)
+            self._learn(callbacks)
+
+    def _learn(self, callbacks: list[RoundCallback | None]) -> None:
+        model = self.model
         model.learn(
             self.config.n_rounds * model.rollout_size * model.n_participants - model.num_timesteps,
             [callback for callback in callbacks if callback is not None],
             reset_num_timesteps=model.round == 0,
-            progress_bar=arguments.progress,
+            progress_bar=self.arguments.progress,
         )
 
     def _monitoring(self) -> list[RoundCallback]:
         from sb3_fedguide.cli.schema import all_names
         from sb3_fedguide.monitoring.callbacks import TensorBoardCallback
         from sb3_fedguide.monitoring.diagnostics import DiagnosticsCallback
+        from sb3_fedguide.monitoring.health import HealthCallback
 
         shown = {"algo": self.arguments.algo, "family": self.family.name, "seed": self.model.seed, **self.config.values}
         pictures = TensorBoardCallback(self.config.n_rounds, self.arguments.picture_freq, shown, all_names())
-        return [DiagnosticsCallback(self._evaluation if self.arguments.eval_average else None), pictures]
+        return [DiagnosticsCallback(self._evaluation if self.arguments.eval_average else None), HealthCallback(), pictures]
 
     def _summary(self) -> dict[str, Any]:
         from sb3_fedguide.cli.report import summarize
@@ -194,5 +205,9 @@ class OfflineStageError(Exception):
 
 
 def one_message(error: Exception) -> str:
-    """An error's message with its lines indented below the first."""
-    return "\n  ".join(str(error).splitlines())
+    """An error's message with its lines indented below the first; of what is too long to be read, beginning and end."""
+    message = str(error)
+    if len(message) > LONGEST_MESSAGE:
+        half = LONGEST_MESSAGE // 2
+        message = f"{message[:half]} ... {message[-half:]}"
+    return "\n  ".join(message.splitlines())

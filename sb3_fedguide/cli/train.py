@@ -6,10 +6,11 @@ Nothing is created on disk, and neither PyTorch nor the simulator is imported, b
 from __future__ import annotations
 
 import argparse
-import importlib
+import importlib.util
 import shlex
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
+PACKAGE = Path(__file__).parents[1]
 ID_PREFIX, ID_SUFFIX = "fed_envs/", "-v0"
 
 
@@ -46,7 +48,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
         else:
             import_packages(arguments.gym_packages)
             family = find_family(arguments)
-            _check_before_imports(arguments)
+            check_before_imports(arguments)
             run = prepare(arguments, family, command)
     except (ValueError, OSError) as error:
         print(f"{prog}: error: {one_message(error)}", file=sys.stderr)
@@ -55,12 +57,16 @@ def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
         print(f"{prog}: interrupted before the run began", file=sys.stderr)
         return EXIT_INTERRUPTED
     from fed_envs.faults import ClientError
+    from sb3_fedguide.engines import EngineError
 
     try:
-        with _no_reports_of_threads():
+        with _no_reports_of_threads(), _short_warnings(prog):
             return run()
     except ClientError as error:
         print(f"{prog}: error: {one_message(error)}; what was written before stays", file=sys.stderr)
+        return EXIT_FAILED
+    except EngineError as error:
+        print(f"{prog}: error: {error}", file=sys.stderr)
         return EXIT_FAILED
     except OSError as error:  # a full disk, or a folder that is read-only
         where = error.filename or arguments.log_folder
@@ -77,6 +83,25 @@ def _no_reports_of_threads() -> Iterator[None]:
         yield
     finally:
         threading.excepthook = before
+
+
+@contextmanager
+def _short_warnings(prog: str) -> Iterator[None]:
+    """Warnings of this package are for the user: without the line of code that Python shows with them."""
+    before = warnings.formatwarning
+
+    def format_warning(
+        message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+    ) -> str:
+        if Path(filename).is_relative_to(PACKAGE):
+            return f"{prog}: warning: {message}\n"
+        return before(message, category, filename, lineno, line)
+
+    warnings.formatwarning = format_warning
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
 
 
 def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Callable[[], int]:
@@ -143,18 +168,27 @@ def find_family(arguments: argparse.Namespace) -> Family:
     return family
 
 
-def _check_before_imports(arguments: argparse.Namespace) -> None:
+def check_before_imports(arguments: argparse.Namespace) -> None:
+    """What the flags and the files that they name already show, without PyTorch and the simulator.
+
+    :raises ValueError: for what is wrong
+    """
     from sb3_fedguide.cli.config import config_path, parse_params, read_config
+    from sb3_fedguide.cli.delays import read_delays
     from sb3_fedguide.cli.run_folder import check_log_folder
     from sb3_fedguide.offline.cache import cache_folder, check_cache_folder
 
     check_names([arguments.algo], ALGORITHMS, "algorithm")
+    if arguments.engine == "ray" and importlib.util.find_spec("ray") is None:
+        raise ValueError("--engine ray needs Ray: pip install 'sb3-fedguide[ray]'")
     check_log_folder(Path(arguments.log_folder))
     if arguments.tensorboard_log is not None:
         check_log_folder(Path(arguments.tensorboard_log))
     check_cache_folder(cache_folder(arguments.cache_dir))
     read_config(config_path(arguments.conf_file, arguments.algo))
     parse_params(arguments.hyperparams)
+    if arguments.delays is not None:
+        arguments.delays = str(read_delays(arguments.delays))  # the run's own, should a file change
 
 
 def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -202,9 +236,11 @@ def make_model(arguments: argparse.Namespace, config: Config, family: Family) ->
     """
     import torch as th
 
+    from sb3_fedguide.cli.delays import read_delays
+
     _check_device(arguments.device)
     th.set_num_threads(1)
-    return config.make(
+    model = config.make(
         family,
         seed=arguments.seed if arguments.seed >= 0 else None,
         device=arguments.device,
@@ -212,6 +248,11 @@ def make_model(arguments: argparse.Namespace, config: Config, family: Family) ->
         cache_dir=arguments.cache_dir,
         verbose=0,
     )
+    if arguments.delays is not None:
+        from sb3_fedguide.common.participation import simulate_delays
+
+        simulate_delays(model, read_delays(arguments.delays))
+    return model
 
 
 def _check_dataset(dataset: str, family: Family) -> None:

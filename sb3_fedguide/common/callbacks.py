@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Event
 from tqdm import tqdm
 
 from fed_envs.state import State, declared_state, load_declared
+from sb3_fedguide.server.rounds import Rounds
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
@@ -77,66 +78,96 @@ def round_callbacks(callback: BaseCallback | None) -> Iterator[RoundCallback]:
 
 
 class ExchangeCallback(RoundCallback):
-    """Plays the server in process: carries uploads to the model's ``strategy`` and broadcasts back, and counts bytes.
+    """Plays the server in process: carries uploads to the model's ``strategy`` and broadcasts back.
 
-    A deployment over a network replaces this callback by its transport; clients and strategy stay the same.
+    Over a network :func:`sb3_fedguide.server.serve.serve` takes its place; clients, strategy and :class:`Rounds` are the same.
     """
 
     state_attributes = ("bytes_up", "bytes_down")
 
     def __init__(self) -> None:
         super().__init__()
-        self.bytes_up = 0
-        self.bytes_down = 0
+        self.server = Rounds(None)
+
+    @property
+    def bytes_up(self) -> int:
+        """Uploaded by all clients together."""
+        return self.server.bytes_up
+
+    @bytes_up.setter
+    def bytes_up(self, value: int) -> None:
+        self.server.bytes_up = value
+
+    @property
+    def bytes_down(self) -> int:
+        """Sent to all clients together."""
+        return self.server.bytes_down
+
+    @bytes_down.setter
+    def bytes_down(self, value: int) -> None:
+        self.server.bytes_down = value
+
+    def save_state(self) -> State:
+        delays = self.model.delays
+        return {**super().save_state(), **({} if delays is None else {"delays": delays.save_state()})}
+
+    def load_state(self, state: State) -> None:
+        """:raises ValueError: for the state of a run with other delays"""
+        super().load_state({name: value for name, value in state.items() if name != "delays"})
+        if (self.model.delays is None) != ("delays" not in state):
+            ran, goes_on = ("with", "without") if self.model.delays is None else ("without", "with")
+            raise ValueError(f"the run was {ran} simulated delays and cannot go on {goes_on} them; see simulate_delays()")
+        if self.model.delays is not None:
+            self.model.delays.load_state(state["delays"])
 
     def _on_training_start(self) -> None:
-        if self.model.round == 0:
-            self.bytes_up, self.bytes_down = self.model.pretraining_bytes
-        strategy = self.model.strategy
-        while strategy is not None and strategy.needs_setup:
-            self._exchange()
+        model = self.model
+        if model.round == 0:
+            self.bytes_up, self.bytes_down = model.pretraining_bytes
+        self.server.strategy = model.strategy
+        self.server.outdated = {client for client, outdated in zip(model.client_ids, model.outdated, strict=True) if outdated}
+        if model.delays is not None and model.round == 0:
+            model.delays.restart()
+        while self.server.needs_setup:
+            self._exchange(model.present)
 
     def _on_round_start(self) -> None:
         model = self.model
+        if model.delays is not None:
+            model.take_part(model.delays.begin(model.round, model.client_fraction))
         for index in np.flatnonzero(model.present & model.outdated).tolist():
-            broadcast = model.strategy.catch_up(model.client_ids[index]) if model.strategy is not None else {}
-            model.receive(index, broadcast)
-            model.outdated[index] = False
-            self.bytes_down += payload_bytes({index: broadcast})
+            model.receive(index, self.server.catch_up(model.client_ids[index]))
+        self._remember_outdated()
 
     def _on_round_end(self) -> None:
-        if self.model.strategy is not None:
-            self._exchange()
+        delays, uploading = self.model.delays, self.model.present
+        if delays is not None:
+            uploading = delays.end()
+            for key, value in delays.figures.items():
+                self.logger.record(key, value)
+        if self.model.strategy is not None and uploading.any():
+            self._exchange(uploading)
 
-    def _exchange(self) -> None:
-        model, strategy = self.model, self.model.strategy
-        assert strategy is not None
+    def _exchange(self, uploading: np.ndarray) -> None:
+        """Carry what the clients ``uploading``, ``(n_clients,)`` bool, send, and what they are sent."""
+        model = self.model
         started = time.perf_counter()
-        present = {client: index for index, client in enumerate(model.client_ids) if model.present[index]}
+        present = {client: index for index, client in enumerate(model.client_ids) if uploading[index]}
         uploads = {client: model.upload(index) for client, index in present.items()}
-        broadcasts = strategy.exchange(model.round, uploads)
+        broadcasts = self.server.exchange(model.round, uploads, set(model.client_ids) - present.keys())
         for client, broadcast in broadcasts.items():
             model.receive(present[client], broadcast)
-        for client, reason in strategy.rejected.items():
+        for client, reason in self.server.rejected.items():
             warnings.warn(f"round {model.round}: the server rejects the upload of client {client}: {reason}", stacklevel=1)
             model.record_client(client, "rejected", 1.0)
-        if any(broadcasts.values()):  # what the others received is what the absent and the rejected have missed
-            model.outdated |= ~model.present
-            model.outdated[[present[client] for client in strategy.rejected]] = True
-        up, down = payload_bytes(uploads), payload_bytes(broadcasts)
-        self.bytes_up += up
-        self.bytes_down += down
-        for key, value in strategy.metrics.items():
-            self.logger.record(f"federated/{key}", value)
-        self.logger.record("federated/bytes_up", up)
-        self.logger.record("federated/bytes_down", down)
-        self.logger.record("federated/bytes_total", self.bytes_up + self.bytes_down)
+        self._remember_outdated()
+        for key, value in self.server.figures.items():
+            self.logger.record(key, value)
         self.logger.record("time/exchange", time.perf_counter() - started)
 
-
-def payload_bytes(payloads: dict[int, dict[str, np.ndarray]]) -> int:
-    """Size of all arrays of all clients' payloads, in bytes."""
-    return sum(array.nbytes for payload in payloads.values() for array in payload.values())
+    def _remember_outdated(self) -> None:
+        """The model's checkpoints and archives hold it."""
+        self.model.outdated[:] = [client in self.server.outdated for client in self.model.client_ids]
 
 
 class RoundProgressCallback(RoundCallback):

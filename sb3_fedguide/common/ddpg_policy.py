@@ -12,9 +12,9 @@ from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from sb3_fedguide.common.stacked_policy import StackedPolicy, check_spaces
+from sb3_fedguide.server.payload import DDPG_ACTOR, DDPG_CRITIC
 
-ACTOR_PREFIXES = ("actor.",)
-CRITIC_PREFIXES = ("critic.",)
+ACTOR_PREFIXES, CRITIC_PREFIXES = DDPG_ACTOR, DDPG_CRITIC
 
 
 class BoundedActor(nn.Module):

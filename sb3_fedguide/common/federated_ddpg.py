@@ -155,7 +155,7 @@ class FederatedDDPG(Federation, DDPG):
                 self.device,
             )
         kwargs = {**self.policy_kwargs, "n_clients": self.n_clients, "init_seed": integer_seed(self.seed, Role.INIT)}
-        if self.n_participants < self.n_clients:
+        if self.partial:
             kwargs["optimizer_class"] = ParticipationAdam
         self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs).to(self.device)  # type: ignore
         self._create_aliases()
@@ -207,7 +207,7 @@ class FederatedDDPG(Federation, DDPG):
         present = None if self.present.all() else self.present
         callback.on_rollout_start()
         noise = self._noise_draws(n_rollout_steps)
-        n_active = int(env.active.sum())
+        n_active = self._active_steps(env)
         raw_obs = self._last_obs.reshape(*shape, -1)  # type: ignore[union-attr]
         for step in range(n_rollout_steps):
             scaled_actions = self._explore(raw_obs, noise[step])
@@ -279,7 +279,7 @@ class FederatedDDPG(Federation, DDPG):
         self._update_learning_rate(self._optimizers())
         ready = self._ready()
         learners: th.Tensor | None = None
-        if self.n_participants < self.n_clients:
+        if self.partial:
             learners = th.as_tensor(np.flatnonzero(ready), device=self.device)
             for optimizer in self._optimizers():
                 optimizer.present = ready  # type: ignore[attr-defined]

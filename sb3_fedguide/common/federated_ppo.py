@@ -150,7 +150,7 @@ class FederatedPPO(Federation, PPO):
             self.action_space,  # type: ignore[arg-type]
         )
         kwargs = {**self.policy_kwargs, "n_clients": self.n_clients, "init_seed": integer_seed(self.seed, Role.INIT)}
-        if self.n_participants < self.n_clients:
+        if self.partial:
             kwargs.update(optimizer_class=ParticipationAdam, optimizer_kwargs={"eps": 1e-5})  # SB3's epsilon for Adam
         self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs).to(self.device)  # type: ignore
         self.clip_range: Schedule = FloatSchedule(self.clip_range)
@@ -205,7 +205,7 @@ class FederatedPPO(Federation, PPO):
         low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
         noise = self._exploration_noise(n_rollout_steps)
         actor_mean = self.policy.fixed_actor_mean()
-        n_active = int(env.active.sum())
+        n_active = self._active_steps(env)
         raw_obs = self._last_obs.reshape(*shape, -1)  # type: ignore[union-attr]
         obs = self.normalizer.normalize_obs(raw_obs)
         starts = self._last_episode_starts.reshape(shape)

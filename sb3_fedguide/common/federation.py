@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +18,6 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Conve
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
-from torch import nn
 
 from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
@@ -28,27 +27,35 @@ from sb3_fedguide.common.export import client_model, export_client
 from sb3_fedguide.common.faults import check_policies, in_round
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.parameters import ParameterFiles
-from sb3_fedguide.common.participation import draw_participants, n_participants
+from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 from sb3_fedguide.common.resumable import Resumable
 from sb3_fedguide.common.seeding import Role, stream
-from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
+from sb3_fedguide.common.warm_start import WarmStart
+from sb3_fedguide.offline.pretraining import PretrainingConfig
+from sb3_fedguide.server.build import COMMON, find_method, make_strategy
+from sb3_fedguide.server.participants import check_fraction, draw_participants, n_participants
 from sb3_fedguide.server.strategy import Payload, Strategy
 from sb3_fedguide.server.validation import UPLOAD_BOUND, check_bound
+
+if TYPE_CHECKING:
+    from sb3_fedguide.engines.engine import Engine
 
 PolicyLike = str | type[ActorCriticPolicy]
 FederationLike = str | Path | Any | Sequence[Callable[[], gym.Env]]
 SelfFederation = TypeVar("SelfFederation", bound="Federation")
 
 
-class Federation(ParameterFiles, Resumable):
+class Federation(WarmStart, ParameterFiles, Resumable):
     """Mixin for SB3 algorithms that train all clients of a family in lockstep.
 
-    A method defines the server's side with :meth:`_make_strategy`, the client's with :meth:`upload` and :meth:`receive`,
-    and its part of the offline stage with :meth:`_pretrain`.
+    A method names the server's side in :attr:`server_method` (or makes it, with :meth:`_make_strategy`), and defines the
+    client's with :meth:`upload` and :meth:`receive`, and its part of the offline stage with :meth:`_pretrain`.
     """
 
     policy: StackedMlpPolicy | StackedDDPGPolicy  # type: ignore[assignment]
+    #: name of the server's side in :data:`sb3_fedguide.server.build.METHODS`
+    server_method: ClassVar[str] = "local"
     normalizer: FederatedNormalizer
     rollout_size: int
     gamma: float
@@ -64,8 +71,7 @@ class Federation(ParameterFiles, Resumable):
         upload_bound: float | None = UPLOAD_BOUND,
     ) -> None:
         """Called by a subclass's constructor, before SB3's."""
-        if not 0.0 < client_fraction <= 1.0:
-            raise ValueError(f"client_fraction={client_fraction} must lie in (0, 1]: it is the share of clients in each round")
+        check_fraction(client_fraction)
         if not 0.0 <= bc_weight <= 1.0:
             raise ValueError(f"bc_weight={bc_weight} must lie in [0, 1]")
         self.client_ids: list[int] = [] if env is None else list(env.client_ids)
@@ -78,6 +84,10 @@ class Federation(ParameterFiles, Resumable):
         self.client_fraction = client_fraction
         check_bound(upload_bound)
         self.upload_bound = upload_bound
+        #: environment steps that one step of a round counts; by default those of the clients that take part here
+        self.steps_at_once: int | None = None
+        #: what trains the clients in other processes; here if ``None``
+        self.engine: Engine | None = None
         #: who takes part in the current round, ``(n_clients,)`` bool
         self.present = np.ones(self.n_clients, dtype=bool)
         #: who missed the last exchange and receives what the server last sent before training again
@@ -106,17 +116,31 @@ class Federation(ParameterFiles, Resumable):
         """Clients that take part in each round."""
         return n_participants(self.client_fraction, self.n_clients)
 
+    @property
+    def partial(self) -> bool:
+        """Whether some clients may be absent from a round: what steps their parameters then counts for each by itself."""
+        return self.client_fraction < 1.0 or (self.delays is not None and self.delays.keep_busy)
+
+    def _active_steps(self, env: FederatedVecEnv) -> int:
+        """Environment steps that one step of this round counts."""
+        return int(env.active.sum()) if self.steps_at_once is None else self.steps_at_once
+
     def _draw_participants(self) -> None:
         """Draw who takes part in the coming round; the others neither step nor train, and all of their state stays."""
         if self.n_participants == self.n_clients:
             return
         assert self.seed is not None
-        self.present = draw_participants(self.seed, self.round, self.n_clients, self.n_participants)
+        self.take_part(draw_participants(self.seed, self.round, self.n_clients, self.n_participants))
+
+    def take_part(self, present: np.ndarray) -> None:
+        """Let the clients ``present``, ``(n_clients,)`` bool, train in the coming round, and no others."""
+        self.present = present
         env = self.get_env()
         assert isinstance(env, FederatedVecEnv)
         env.active = np.repeat(self.present, self.n_envs_per_client)
-        for optimizer in self._optimizers():
-            optimizer.present = self.present  # type: ignore[attr-defined]
+        if self.partial:
+            for optimizer in self._optimizers():
+                optimizer.present = self.present  # type: ignore[attr-defined]
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         """Everything that steps stacked parameters."""
@@ -134,6 +158,17 @@ class Federation(ParameterFiles, Resumable):
             self._streams[role] = [stream(self.seed, role, client) for client in self.client_ids]
         return self._streams[role]
 
+    def complete_state(self) -> None:
+        """Make what a client gets when it first trains, for all clients: none then differs from the others in kind.
+
+        It changes nothing that they will do.
+        """
+        for role in Role:
+            self.streams(role)
+        for optimizer in self._optimizers():
+            if isinstance(optimizer, ParticipationAdam):
+                optimizer.make_state()
+
     def sends_policy(self, round: int) -> bool:
         """Whether the exchange after round ``round`` replaces the clients' policies; what it sent is evaluated as well."""
         return False
@@ -147,7 +182,12 @@ class Federation(ParameterFiles, Resumable):
 
     def _make_strategy(self) -> Strategy | None:
         """The server's side of this method; ``None`` where nothing is exchanged."""
-        return None
+        assert self.seed is not None
+        return make_strategy(self.server_method, self.server_settings(), self.n_clients, self.seed)
+
+    def server_settings(self) -> dict[str, Any]:
+        """What the server of this method has to know, by the names of the constructor's parameters."""
+        return {name: getattr(self, name) for name in (*COMMON, *find_method(self.server_method).defaults)}
 
     def upload(self, index: int) -> Payload:
         """What the client at position ``index`` sends: float32 arrays and nothing else."""
@@ -156,50 +196,9 @@ class Federation(ParameterFiles, Resumable):
     def receive(self, index: int, broadcast: Payload) -> None:
         """Take what the server sent to the client at position ``index``."""
 
-    def _pretrain(self, stage: Pretraining) -> None:
-        """A method's own part of the offline stage."""
-
-    def pretrain(self, progress_bar: bool = False) -> None:
-        """The offline stage: behaviour cloning and whatever the method needs; results are cached. Runs at most once.
-
-        :raises ValueError: where the method needs offline data and none can be had
-        """
-        if self.pretrained:
-            return
-        assert self.seed is not None
-        stage = Pretraining(
-            self.family,
-            self.client_ids,
-            self.pretraining_config.model_copy(update={"gamma": self.gamma}),
-            seed=self.seed,
-            cache_dir=self.cache_dir,
-            progress_bar=progress_bar,
-            env_spaces=(self.observation_space, self.action_space),
-        )
-        if self.bc_weight > 0:
-            self._initialize_from_behavior_cloning(stage)
-        self._pretrain(stage)
-        self.pretrained = True
-
-    def _actors(self) -> nn.Module:
-        """A copy of the stacked actors by themselves: observations to actions in the action space's own units."""
-        assert isinstance(self.policy, StackedMlpPolicy)
-        return self.policy.actor()
-
-    def _initialize_from_behavior_cloning(self, stage: Pretraining) -> None:
-        """theta_0 = (1 - alpha) theta_rand + alpha theta_BC, both from the same initial actor.
-
-        With running normalisation, each client's observation statistics start from its own offline data, in whose scale
-        the actor was cloned.
-        """
-        if self.normalize:
-            for index, data in enumerate(stage.datasets()):
-                obs = data.observations.astype(np.float64)
-                self.normalizer.warm_start(index, obs.mean(axis=0), obs.var(axis=0), len(obs))
-        cloned = stage.behavior_cloning(self._actors(), normalize=self.normalize)
-        with th.no_grad():
-            for name, tensor in cloned.items():
-                self.policy.actor_parameter(name).lerp_(tensor.to(self.device), self.bc_weight)
+    def upload_shapes(self) -> dict[str, list[int]]:
+        """Shapes of what a client uploads by name, known before the offline stage; what only comes later is left out."""
+        return {name: list(array.shape) for name, array in self.upload(0).items()}
 
     def learn(
         self: SelfFederation,
@@ -212,6 +211,28 @@ class Federation(ParameterFiles, Resumable):
     ) -> SelfFederation:
         """Train for ``total_timesteps`` steps of all clients together, rounded up to whole rounds; otherwise as in SB3."""
         self.pretrain(progress_bar)
+        total_timesteps, callbacks, rounds = self.start_learning(
+            total_timesteps, callback, tb_log_name, reset_num_timesteps, progress_bar
+        )
+        while self.num_timesteps < total_timesteps:
+            with in_round(self.round + 1):
+                if not self.play_round(callbacks, rounds, log_interval):
+                    break
+        callbacks.on_training_end()
+        return self
+
+    def start_learning(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback, list[RoundCallback]]:
+        """What comes before the first :meth:`play_round`, after :meth:`pretrain`; arguments are those of :meth:`learn`.
+
+        :return: the value of ``num_timesteps`` at which the training ends, all callbacks, and those of rounds among them
+        """
         reset = reset_num_timesteps or self._last_obs is None
         # SB3 offers no event after train(), and off policy it knows no rounds, so the loop is our own: train, exchange, log.
         with in_round(1 if reset_num_timesteps else self.round + 1):
@@ -227,24 +248,15 @@ class Federation(ParameterFiles, Resumable):
         rounds = list(round_callbacks(callbacks))
         self._resume_callbacks(rounds)
         callbacks.on_training_start(locals(), globals())
-        while self.num_timesteps < total_timesteps:
-            with in_round(self.round + 1):
-                if not self._play_round(callbacks, rounds, log_interval):
-                    break
-        callbacks.on_training_end()
-        return self
+        return total_timesteps, callbacks, rounds
 
-    def _play_round(self, callbacks: BaseCallback, rounds: list[RoundCallback], log_interval: int | None) -> bool:
+    def play_round(self, callbacks: BaseCallback, rounds: list[RoundCallback], log_interval: int | None) -> bool:
         """Train, exchange, log; false where a callback ended the training."""
         self._draw_participants()
         for hook in rounds:
             hook.on_round_start()
-        try:
-            if not self._train_round(callbacks):
-                return False
-        except ClientError:
-            self._check_experience()  # what an environment returned explains an action that is not finite
-            raise
+        if not (self.train_locally(callbacks) if self.engine is None else self.engine.train_round(self, callbacks)):
+            return False
         check_policies(self.client_ids, self.policy)
         for hook in rounds:
             hook.on_local_training_end()
@@ -254,6 +266,17 @@ class Federation(ParameterFiles, Resumable):
         if log_interval is not None and self.round % log_interval == 0:
             self.dump_logs(self.round)
         return all([hook.on_round_logged() for hook in rounds])
+
+    def train_locally(self, callbacks: BaseCallback) -> bool:
+        """One round's training in this process; false where a callback ended it.
+
+        :raises ClientError: where a client's environment or policy broke
+        """
+        try:
+            return self._train_round(callbacks)
+        except ClientError:
+            self._check_experience()  # what an environment returned explains an action that is not finite
+            raise
 
     @abstractmethod
     def _check_experience(self) -> None:
@@ -350,7 +373,7 @@ class Federation(ParameterFiles, Resumable):
         return self.client_ids.index(client_id)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "normalizer", "episode_infos"]
+        return [*super()._excluded_save_params(), "normalizer", "episode_infos", "engine"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "normalizer"], []

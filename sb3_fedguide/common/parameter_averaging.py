@@ -7,10 +7,14 @@ from typing import Literal
 import numpy as np
 
 from sb3_fedguide.common.federation import Federation
-from sb3_fedguide.server.averaging import Aggregator, Averaging, averaging_is_due, check_aggregator
-from sb3_fedguide.server.strategy import N_SAMPLES, Payload, Strategy
-
-AVERAGE_CHOICES = ("all", "actor", "critic")
+from sb3_fedguide.server.averaging import (
+    Aggregator,
+    averaged_prefixes,
+    averaging_is_due,
+    check_aggregator,
+    check_averaging,
+)
+from sb3_fedguide.server.strategy import N_SAMPLES, Payload
 
 
 class ParameterAveraging(Federation):
@@ -25,10 +29,7 @@ class ParameterAveraging(Federation):
         trim_fraction: float,
     ) -> None:
         """Called by a subclass's constructor, before its base's."""
-        if average not in AVERAGE_CHOICES:
-            raise ValueError(f"average={average!r} must be one of {', '.join(AVERAGE_CHOICES)}")
-        if average_every < 1:
-            raise ValueError(f"average_every={average_every} must be at least 1 round")
+        check_averaging(average, average_every)
         check_aggregator(aggregator, trim_fraction)
         self.aggregator = aggregator
         self.trim_fraction = trim_fraction
@@ -39,14 +40,10 @@ class ParameterAveraging(Federation):
     @property
     def averaged_prefixes(self) -> tuple[str, ...]:
         """How the names of the parameters begin that are averaged."""
-        actor, critic = self.policy.actor_prefixes, self.policy.critic_prefixes
-        return {"all": actor + critic, "actor": actor, "critic": critic}[self.average]
+        return averaged_prefixes(self.average, self.policy.actor_prefixes, self.policy.critic_prefixes)
 
     def sends_policy(self, round: int) -> bool:
         return self.average != "critic" and averaging_is_due(round, self.average_every, self.average_until)
-
-    def _make_strategy(self) -> Strategy:
-        return Averaging(self.averaged_prefixes, self.average_every, self.average_until, self.aggregator, self.trim_fraction)
 
     def upload(self, index: int) -> Payload:
         return policy_upload(self, index, self.averaged_prefixes)

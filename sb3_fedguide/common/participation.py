@@ -1,26 +1,37 @@
-"""Partial participation: who takes part in a round, and an optimiser that leaves the others untouched."""
+"""Partial participation: an optimiser that leaves those untouched who do not take part in a round."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch as th
 
-from sb3_fedguide.common.seeding import Role, stream
+from sb3_fedguide.server.delays import Delays, DelaySettings
+from sb3_fedguide.server.participants import draw_participants, n_participants
+
+if TYPE_CHECKING:
+    from sb3_fedguide.common.federation import Federation
+
+__all__ = ["ParticipationAdam", "draw_participants", "n_participants", "simulate_delays"]
 
 
-def n_participants(client_fraction: float, n_clients: int) -> int:
-    """Clients in each round: the fraction of all, rounded, and at least one."""
-    return max(1, round(client_fraction * n_clients))
+def simulate_delays(model: Federation, settings: DelaySettings) -> None:
+    """Let the clients' rounds take simulated time, before the model is trained or loads parameters.
 
+    Who is busy neither trains nor receives; ``num_timesteps`` counts every round as if nobody were, so that the number of
+    rounds stays what it is without delays.
 
-def draw_participants(seed: int, round: int, n_clients: int, n_present: int) -> np.ndarray:
-    """Who takes part in a round, ``(n_clients,)`` bool, drawn without replacement from the server's stream of that round."""
-    present = np.zeros(n_clients, dtype=bool)
-    present[stream(seed, Role.PARTICIPATION, round).choice(n_clients, n_present, replace=False)] = True
-    return present
+    :raises ValueError: for a model that has trained, or has been through its offline stage
+    """
+    if model.pretrained or model.round > 0:
+        raise ValueError("delays have to be there from the beginning: call simulate_delays() on a new model")
+    assert model.seed is not None
+    model.delays = Delays(settings, model.seed, model.client_ids)
+    model.steps_at_once = model.n_participants * model.n_envs_per_client
+    if model.delays.keep_busy:
+        model._setup_model()  # with an optimiser that leaves the busy alone
 
 
 class ParticipationAdam(th.optim.Optimizer):
@@ -45,6 +56,15 @@ class ParticipationAdam(th.optim.Optimizer):
         #: ``(n_clients,)`` bool: who steps; all if ``None``
         self.present: np.ndarray | None = None
 
+    def make_state(self) -> None:
+        """Moments and step counts, zero, of the parameters that have none yet."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                state = self.state[parameter]
+                if not state:
+                    state["step"] = th.zeros(len(parameter), dtype=th.float64)
+                    state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(parameter), th.zeros_like(parameter)
+
     @th.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> Any:  # type: ignore[override]
         """One step of the clients that are present.
@@ -53,15 +73,13 @@ class ParticipationAdam(th.optim.Optimizer):
         """
         if closure is not None:
             raise ValueError("ParticipationAdam takes no closure; compute the gradients before step()")
+        self.make_state()
         for group in self.param_groups:
             beta1, beta2 = group["betas"]
             for parameter in group["params"]:
                 if parameter.grad is None:
                     continue
                 state = self.state[parameter]
-                if not state:
-                    state["step"] = th.zeros(len(parameter), dtype=th.float64)
-                    state["exp_avg"], state["exp_avg_sq"] = th.zeros_like(parameter), th.zeros_like(parameter)
                 rows = np.arange(len(parameter)) if self.present is None else np.flatnonzero(self.present)
                 chosen = th.as_tensor(rows)
                 state["step"][chosen] += 1

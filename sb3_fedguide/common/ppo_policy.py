@@ -16,9 +16,9 @@ from torch import nn
 from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.stacked import fixed_forward, stack_tensor
 from sb3_fedguide.common.stacked_policy import StackedPolicy, check_spaces
+from sb3_fedguide.server.payload import PPO_ACTOR, PPO_CRITIC
 
-ACTOR_PREFIXES = ("mlp_extractor.policy_net.", "action_net.", "log_std")
-CRITIC_PREFIXES = ("mlp_extractor.value_net.", "value_net.")
+ACTOR_PREFIXES, CRITIC_PREFIXES = PPO_ACTOR, PPO_CRITIC
 
 
 class StackedActor(nn.Module):

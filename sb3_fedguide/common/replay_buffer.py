@@ -100,20 +100,22 @@ class FederatedReplayBuffer(ReplayBuffer):
 
     def save_state(self) -> State:
         """The transitions that there are, and where the next ones go."""
-        filled = int(self.sizes.max())
-        arrays = {name: getattr(self, name)[:filled].copy() for name in _ARRAYS}
-        return {"sizes": self.sizes.copy(), "positions": self.positions.copy(), **arrays}
+        transitions = [
+            {name: getattr(self, name)[:size, client].copy() for name in _ARRAYS} for client, size in enumerate(self.sizes)
+        ]
+        return {"sizes": self.sizes.copy(), "positions": self.positions.copy(), "transitions": transitions}
 
     def load_state(self, state: State) -> None:
         """Take the transitions of :meth:`save_state`.
 
         :raises ValueError: where they do not fit, such as those of a larger buffer
         """
-        for name in _ARRAYS:
-            array, own = state[name], getattr(self, name)
-            if len(array) > self.buffer_size or array.shape[1:] != own.shape[1:]:
-                raise ValueError(f"{name} of shape {array.shape} do not fit into a replay buffer of shape {own.shape}")
-            own[: len(array)] = array
+        for client, transitions in enumerate(state["transitions"]):
+            for name in _ARRAYS:
+                array, own = transitions[name], getattr(self, name)
+                if len(array) > self.buffer_size or array.shape[1:] != own.shape[2:]:
+                    raise ValueError(f"{name} of shape {array.shape} do not fit into a replay buffer of shape {own.shape}")
+                own[: len(array), client] = array
         self.sizes[:], self.positions[:] = state["sizes"], state["positions"]
 
     def sample(  # type: ignore[override]

@@ -17,7 +17,9 @@ from sb3_fedguide.common.array_files import array_mismatches
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointError, newest_checkpoint
 from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.optimizer_state import load_optimizer, optimizer_state
 from sb3_fedguide.common.stacked import to_arrays, to_tensors
+from sb3_fedguide.server.delays import Delays
 from sb3_fedguide.server.strategy import Strategy
 
 SelfResumable = TypeVar("SelfResumable", bound="Resumable")
@@ -36,6 +38,10 @@ class Resumable(BaseAlgorithm):
         "seed", "num_timesteps", "round", "_n_updates", "_episode_num", "_current_progress_remaining", "pretrained",
         "pretraining_bytes", "present", "outdated", "episode_infos", "_streams", "_last_obs", "_last_episode_starts",
     )  # fmt: skip
+    #: entries of the state without one entry per client, as paths (``"modules.prior"``); those of base classes are added
+    shared_state: ClassVar[tuple[str, ...]] = ("identity", "random", "strategy")
+    #: simulated time, see :func:`sb3_fedguide.common.participation.simulate_delays`; none if ``None``
+    delays: Delays | None = None
     normalizer: FederatedNormalizer
     strategy: Strategy | None
     client_ids: list[int]
@@ -68,7 +74,7 @@ class Resumable(BaseAlgorithm):
             "identity": self._identity(),
             "attributes": declared_state(self),
             "policy": to_arrays(self.policy.state_dict()),
-            "optimizers": [_optimizer_state(optimizer) for optimizer in self._optimizers()],
+            "optimizers": [optimizer_state(optimizer) for optimizer in self._optimizers()],
             "normalizer": to_arrays(self.normalizer.state_dict()),
             "strategy": None if self.strategy is None else self.strategy.save_state(),
             "env": self._federated_env().save_state(),
@@ -97,7 +103,7 @@ class Resumable(BaseAlgorithm):
         load_declared(self, state["attributes"])
         self.policy.load_state_dict(to_tensors(state["policy"]))
         for optimizer, saved in zip(self._optimizers(), state["optimizers"], strict=True):
-            _load_optimizer(optimizer, saved)
+            load_optimizer(optimizer, saved)
         self.normalizer.load_state_dict(to_tensors(state["normalizer"]))
         if self.strategy is not None:
             self.strategy.load_state(state["strategy"])
@@ -168,20 +174,3 @@ def _holds_arrays(value: Any) -> bool:
     if isinstance(value, (list, tuple)):
         return any(map(_holds_arrays, value))
     return isinstance(value, (np.ndarray, th.Tensor))
-
-
-def _optimizer_state(optimizer: th.optim.Optimizer) -> State:
-    """Moments and step counts of each parameter in the optimiser's order, and the groups' learning rates."""
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    return {
-        "parameters": [to_arrays(optimizer.state.get(parameter, {})) for parameter in parameters],
-        "learning_rates": [float(group["lr"]) for group in optimizer.param_groups],
-    }
-
-
-def _load_optimizer(optimizer: th.optim.Optimizer, saved: State) -> None:
-    state = optimizer.state_dict()
-    state["state"] = {index: to_tensors(arrays) for index, arrays in enumerate(saved["parameters"]) if arrays}
-    for group, learning_rate in zip(state["param_groups"], saved["learning_rates"], strict=True):
-        group["lr"] = learning_rate
-    optimizer.load_state_dict(state)

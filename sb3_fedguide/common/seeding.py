@@ -29,3 +29,4 @@ class Role(IntEnum):
     DICE = 10
     SERVER = 11
     PARTICIPATION = 12
+    DELAY = 13

@@ -43,8 +43,8 @@ def record_training(model: FederatedPPO, statistics: RoundStatistics, schedules:
     for name, per_client in means.items():
         model.logger.record(f"train/{name}", float(np.mean(per_client[model.present])))
     for name in ("approx_kl", "explained_variance", "std", "grad_norm"):
-        for client, value in zip(model.client_ids, means[name], strict=True):
-            model.record_client(client, name, float(value))
+        for index in np.flatnonzero(model.present):
+            model.record_client(model.client_ids[index], name, float(means[name][index]))
     model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
     for name, schedule in schedules.items():
         if schedule is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,18 @@ from gymnasium import spaces
 from torch import nn
 
 from fed_envs import Family, load_family
+from sb3_fedguide.common.parameters import take_prefix
 from sb3_fedguide.common.seeding import Role, stream
+from sb3_fedguide.common.stacked import to_tensors
 from sb3_fedguide.offline.behavior_cloning import clone
 from sb3_fedguide.offline.cache import arrays_hash, cache_folder, cached_arrays, content_key, keep_arrays
 from sb3_fedguide.offline.config import Piece, PretrainingConfig
 from sb3_fedguide.offline.datasets import OfflineData, client_datasets, normalize_observations
 from sb3_fedguide.offline.dice import DiceValue, train_dice
 from sb3_fedguide.offline.progress import Progress, TqdmProgress, stage_progress
-from sb3_fedguide.offline.trunk import federated_trunk
+from sb3_fedguide.offline.trunk import TrunkTraining, federated_trunk
 from sb3_fedguide.priors import DiffusionPrior, GaussianPrior, HeadStatistics, Prior
+from sb3_fedguide.server.trunk import MOMENTS, TRUNK
 
 __all__ = ["PretrainedPrior", "Pretraining", "PretrainingConfig", "untrained_prior"]
 
@@ -69,6 +72,8 @@ class Pretraining:
     :param progress_bar: draw a bar per piece
     :param progress: called with ``(stage, done, total)`` instead
     :param env_spaces: observation and action space, checked against a given dataset; needed if ``family`` is ``None``
+    :param trunk: the diffusion prior's trunk where it was trained elsewhere, as
+        :meth:`sb3_fedguide.server.trunk.TrunkAverages.payload` gives it; otherwise all clients' data are needed here
     :raises ValueError: if there is neither a family nor a dataset
     """
 
@@ -82,6 +87,7 @@ class Pretraining:
         progress_bar: bool = False,
         progress: Progress | None = None,
         env_spaces: tuple[spaces.Space, spaces.Space] | None = None,
+        trunk: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         self.family = None if family is None else load_family(family)
         self.client_ids = list(client_ids)
@@ -92,6 +98,7 @@ class Pretraining:
         self._progress = progress if progress is not None else TqdmProgress() if progress_bar else None
         self._data: dict[int, OfflineData] = {}
         self._trunk: tuple[Prior, int, int] | None = None
+        self._given_trunk = trunk
 
     def datasets(self, client_ids: Sequence[int] | None = None) -> list[OfflineData]:
         """Offline data of the clients that live here, or of ``client_ids``.
@@ -165,10 +172,45 @@ class Pretraining:
         All clients of the family take part, wherever they live: otherwise a client's prior would depend on its neighbours.
         """
         if self._trunk is None:
-            data = self.datasets()[0]
-            prior = untrained_prior(self.family, self.config, data.observations.shape[1], data.actions.shape[1], self.seed)
-            self._trunk = self._diffusion(prior) if isinstance(prior, DiffusionPrior) else (prior, 0, 0)
+            prior = self.untrained_prior()
+            if not isinstance(prior, DiffusionPrior):
+                self._trunk = prior, 0, 0
+            elif self._given_trunk is None:
+                self._trunk = self._diffusion(prior)
+            else:  # whoever trained it has counted the bytes
+                self._trunk = _with_trunk(prior, self._given_trunk), 0, 0
         return self._trunk
+
+    def untrained_prior(self) -> Prior:
+        """The common part of the priors as it is before training, see :func:`untrained_prior`."""
+        if self.env_spaces is not None:
+            observations, actions = (space.shape[0] for space in self.env_spaces)  # type: ignore[index]
+        else:
+            data = self.datasets()[0]
+            observations, actions = data.observations.shape[1], data.actions.shape[1]
+        return untrained_prior(self.family, self.config, observations, actions, self.seed)
+
+    def trunk_settings(self) -> dict[str, Any] | None:
+        """What clients that train a trunk together have to agree on; ``None`` where the prior has none."""
+        return self.config.settings("prior") if isinstance(self.untrained_prior(), DiffusionPrior) else None
+
+    def trunk_updates(self) -> list[int]:
+        """Updates of the trunk that each client's data ask for; the longest counts."""
+        return [self.config.n_updates("prior", len(rows)) for rows in self.datasets()]
+
+    def trunk_training(self, mean: np.ndarray, std: np.ndarray, n_updates: int) -> TrunkTraining:
+        """The part of the trunk's training that the clients do who live here.
+
+        :param mean: of all clients' observations together, ``(obs_dim,)``; ``std`` likewise
+        :param n_updates: of the whole training
+        """
+        prior = self.untrained_prior()
+        assert isinstance(prior, DiffusionPrior)
+        prior.set_observation_moments(mean, std)
+        rngs = [stream(self.seed, Role.TRUNK, client) for client in self.client_ids]
+        return TrunkTraining(
+            prior, self.datasets(), rngs, n_updates, self.config.prior_batch_size, self.config.prior_learning_rate
+        )
 
     def prior(self) -> PretrainedPrior:
         """The action priors: the common part, and each client's head fitted on its own data in closed form."""
@@ -301,6 +343,13 @@ def untrained_prior(family: Family | None, config: PretrainingConfig, obs_dim: i
     if (automatic if config.prior == "auto" else config.prior) == "gaussian":
         return GaussianPrior(obs_dim, action_dim)
     return DiffusionPrior(obs_dim, action_dim, width=config.prior_width, rng=stream(seed, Role.TRUNK))
+
+
+def _with_trunk(prior: DiffusionPrior, trunk: Mapping[str, np.ndarray]) -> DiffusionPrior:
+    """``prior`` with the moments and parameters of a trained trunk, frozen."""
+    prior.set_observation_moments(trunk[f"{MOMENTS}mean"], trunk[f"{MOMENTS}std"])
+    prior.trunk.load_state_dict(to_tensors(take_prefix(dict(trunk), TRUNK)))
+    return prior.requires_grad_(False)
 
 
 def _take_clients(module: nn.Module, indices: list[int]) -> nn.Module:

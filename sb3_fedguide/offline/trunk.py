@@ -17,12 +17,15 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_fedguide.common.stacked import StackedLinear, client_state, stack_module
+from fed_envs.plain_data import State, freeze, thaw
+from sb3_fedguide.common.optimizer_state import load_optimizer, optimizer_state
+from sb3_fedguide.common.stacked import StackedLinear, client_state, stack_module, to_arrays, to_tensors
 from sb3_fedguide.offline.groups import client_groups, train_together
 from sb3_fedguide.offline.progress import StepProgress
 from sb3_fedguide.priors.density import training_angle
 from sb3_fedguide.priors.diffusion import DiffusionPrior
 from sb3_fedguide.priors.trunk_network import DiffusionTrunk
+from sb3_fedguide.server.trunk import average_uploads, merge_moments
 
 __all__ = [
     "TrunkResult",
@@ -70,33 +73,6 @@ def observation_moments(observations: np.ndarray) -> Upload:
         "n_samples": np.array(len(observations), dtype=np.float64),
         "mean": observations.mean(axis=0),
         "var": observations.var(axis=0),
-    }
-
-
-def merge_moments(uploads: Sequence[Mapping[str, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of the union of the clients' data, from their moments alone (Chan et al. 1979)."""
-    if not uploads:
-        raise ValueError("merge_moments needs the moments of at least one client.")
-    count = float(uploads[0]["n_samples"])
-    mean, squares = uploads[0]["mean"], uploads[0]["var"] * count
-    for upload in uploads[1:]:
-        n = float(upload["n_samples"])
-        total = count + n
-        delta = upload["mean"] - mean
-        squares = squares + upload["var"] * n + delta**2 * (count * n / total)
-        mean = mean + delta * (n / total)
-        count = total
-    return mean, np.sqrt(squares / count)
-
-
-def average_uploads(uploads: Sequence[Mapping[str, np.ndarray]], n_samples: Sequence[int]) -> Upload:
-    """FedAvg: the mean of the clients' parameters, weighted by their samples, in float64."""
-    weights = np.asarray(n_samples, dtype=np.float64) / np.sum(n_samples)
-    return {
-        name: np.sum([w * upload[name].astype(np.float64) for w, upload in zip(weights, uploads, strict=True)], axis=0).astype(
-            np.float32
-        )
-        for name in uploads[0]
     }
 
 
@@ -174,6 +150,24 @@ class TrunkTraining:
         with th.no_grad():
             for name, parameter in self.trunk.named_parameters():
                 parameter.copy_(th.from_numpy(trunk[name]).expand_as(parameter))
+
+    def save_state(self) -> State:
+        """Everything that changes while it trains, as plain data for a checkpoint."""
+        return {
+            "n_done": self.n_done,
+            "trunk": to_arrays(self.trunk.state_dict()),
+            "head": to_arrays(self.head.state_dict()),
+            "optimizer": optimizer_state(self.optimizer),
+            "rngs": freeze(self.rngs),
+        }
+
+    def load_state(self, state: State) -> None:
+        """Go on from what :meth:`save_state` returned, on a training with the same data and settings."""
+        self.n_done = state["n_done"]
+        self.trunk.load_state_dict(to_tensors(state["trunk"]))
+        self.head.load_state_dict(to_tensors(state["head"]))
+        load_optimizer(self.optimizer, state["optimizer"])
+        self.rngs = thaw(state["rngs"])
 
     def _batch(self) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
         """Standardised observations, noisy actions, noise angles and velocities, ``(n_clients, batch, ...)``."""

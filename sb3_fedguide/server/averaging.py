@@ -55,6 +55,25 @@ def averaging_is_due(round: int, every: int, until: int | None = None) -> bool:
     return round > 0 and round % every == 0 and (until is None or round <= until)
 
 
+AVERAGE_CHOICES = ("all", "actor", "critic")
+
+
+def averaged_prefixes(average: str, actor: tuple[str, ...], critic: tuple[str, ...]) -> tuple[str, ...]:
+    """How the names of the parameters begin that are averaged.
+
+    :param average: one of :data:`AVERAGE_CHOICES`
+    """
+    return {"all": actor + critic, "actor": actor, "critic": critic}[average]
+
+
+def check_averaging(average: str, average_every: int) -> None:
+    """:raises ValueError: for an unknown choice, or a number of rounds below one"""
+    if average not in AVERAGE_CHOICES:
+        raise ValueError(f"average={average!r} must be one of {', '.join(AVERAGE_CHOICES)}")
+    if average_every < 1:
+        raise ValueError(f"average_every={average_every} must be at least 1 round")
+
+
 def check_aggregator(aggregator: str, trim_fraction: float) -> None:
     """:raises ValueError: for an unknown aggregator, or a fraction that leaves nothing"""
     if aggregator not in AGGREGATORS:

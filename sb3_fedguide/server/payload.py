@@ -9,3 +9,9 @@ Payload = dict[str, np.ndarray]
 
 #: Key of an upload's number of samples, the weight of its client in averages.
 N_SAMPLES = "n_samples"
+
+#: How the names of a policy's parameters begin, SB3's: PPO's actor (with ``log_std``) and critic, and DDPG's.
+PPO_ACTOR = ("mlp_extractor.policy_net.", "action_net.", "log_std")
+PPO_CRITIC = ("mlp_extractor.value_net.", "value_net.")
+DDPG_ACTOR = ("actor.",)
+DDPG_CRITIC = ("critic.",)

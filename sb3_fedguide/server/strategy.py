@@ -10,7 +10,7 @@ from sb3_fedguide.server.payload import N_SAMPLES, Payload
 from sb3_fedguide.server.validation import UPLOAD_BOUND, check_uploads
 
 if TYPE_CHECKING:
-    from fed_envs.state import State
+    from fed_envs.plain_data import State
 
 __all__ = ["N_SAMPLES", "Composite", "Payload", "Strategy"]
 
@@ -117,7 +117,7 @@ class Strategy(ABC):
                 for part, part_saved in zip(own, saved, strict=True):
                     part.load_state(part_saved)
             else:
-                from fed_envs.state import thaw  # the server needs no environments until it is checkpointed
+                from fed_envs.plain_data import thaw  # the server needs no environments until it is checkpointed
 
                 setattr(self, name, thaw(saved))
 
@@ -157,6 +157,6 @@ def _have_state(value: Any) -> bool:
 def _saved(value: Any) -> Any:
     if hasattr(value, "save_state"):
         return value.save_state()
-    from fed_envs.state import freeze
+    from fed_envs.plain_data import freeze
 
     return [part.save_state() for part in value] if _have_state(value) else freeze(value)

@@ -1,0 +1,153 @@
+"""What stragglers and dropouts cost: returns by round and by simulated wall time, for many clients.
+
+    python benchmarks/delays.py --clients 64 256
+    python benchmarks/delays.py --table
+    python benchmarks/delays.py --figure docs/delays.png
+
+Clients are generated: Bandit2D with ``off_peak_weight``, so that a client's own peak pays most and the other three less.
+Every cell is a training run; finished ones are kept in ``benchmarks/results/delays_Bandit2D.json``, so that an interrupted
+benchmark goes on where it stopped. A return is that of the deterministic policies which the clients have at that simulated
+second: of the last training that each has finished.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+
+from fed_envs import Family
+from fed_envs.bandit2d import ACTION_LIMIT, reward
+from fed_envs.clients import BANDIT2D_PEAKS
+from fed_envs.generation import generate_family
+from fed_envs.metadata import parse_family
+from sb3_fedguide.benchmark.bandit2d import policies
+from sb3_fedguide.cli.config import resolve
+from sb3_fedguide.common.callbacks import RoundCallback
+from sb3_fedguide.common.participation import simulate_delays
+from sb3_fedguide.server.delays import parse_delays
+
+PATH = Path(__file__).parent / "results" / "delays_Bandit2D.json"
+ALGOS = ("local", "fedavg", "fedguide")
+OFF_PEAK_WEIGHT = 0.5
+
+#: The same clients, equally slow under all three, and what the server waits for.
+CLIENTS = "median=60,spread=0.8,jitter=0.3,dropout=0.05,timeout=120"
+WAITING = {"sync": f"sync:{CLIENTS}", "deadline": f"deadline:{CLIENTS},deadline=90", "async": f"async:{CLIENTS},tick=30"}
+#: The server's rounds in a cell. A tick is half of the median client's round.
+ROUNDS = {"sync": 40, "deadline": 40, "async": 80}
+
+#: The tuned settings with smaller rollouts, fewer updates offline and fewer experts, so that a cell takes seconds.
+SETTINGS: dict[str, Any] = {
+    "rollout_size": 100,
+    "n_envs_per_client": 10,
+    "batch_size": 50,
+    "learning_rate": 5e-4,
+    "pretraining.dataset_size": 100,
+    "pretraining.bc_updates": 300,
+}
+GUIDED: dict[str, Any] = {
+    "n_experts": 8,
+    "prior_loss": "sample",
+    "pretraining.dice_updates": 100,
+    "pretraining.dice_width": 16,
+}
+
+
+def family_of(n_clients: int) -> Family:
+    """Every second client owns the first peak, the others the other three in turn; each likes the others' half as much."""
+    family = generate_family("Bandit2D", n_clients)
+    peaks = [0 if k % 2 == 0 else 1 + k // 2 % 3 for k in range(n_clients)]
+    content = family.to_dict()
+    for client, peak in zip(content["clients"], peaks, strict=True):
+        client.update(peak=list(BANDIT2D_PEAKS[peak]), off_peak_weight=OFF_PEAK_WEIGHT)
+    return parse_family(content, family.name)
+
+
+class Course(RoundCallback):
+    """Second, average and worst return after every round, and who was heard."""
+
+    def __init__(self, family: Family) -> None:
+        super().__init__()
+        self.family = family
+        self.rows: list[tuple[float, float]] = []
+        self.arrived: list[float] = []
+        self.staleness: list[float] = []
+
+    def _returns(self) -> np.ndarray:
+        means = policies(self.model).mean  # type: ignore[arg-type]
+        actions = np.clip(means, -ACTION_LIMIT, ACTION_LIMIT)
+        return np.array([reward(action, client) for action, client in zip(actions, self.family.clients, strict=True)])
+
+    def _on_training_start(self) -> None:
+        self.deployed = self.trained = self._returns()
+        self.rows.append((0.0, float(self.deployed.mean())))
+
+    def _on_local_training_end(self) -> None:
+        self.trained = np.where(self.model.present, self._returns(), self.trained)
+
+    def _on_round_end(self) -> None:
+        delays = self.model.delays
+        assert delays is not None
+        self.deployed = np.where(delays.finished, self.trained, self.deployed)
+        self.rows.append((delays.seconds, float(self.deployed.mean())))
+        self.arrived.append(delays.figures["federated/arrived"])
+        self.staleness.append(delays.figures.get("federated/staleness", np.nan))
+
+
+def run_cell(n_clients: int, algo: str, waiting: str, seed: int) -> dict[str, Any]:
+    family, n_rounds = family_of(n_clients), ROUNDS[waiting]
+    settings = {**SETTINGS, **(GUIDED if algo == "fedguide" else {}), "n_rounds": n_rounds}
+    started = time.process_time()
+    model = resolve(algo, family, overrides=settings).make(family, seed=seed)
+    simulate_delays(model, parse_delays(WAITING[waiting]))
+    course = Course(family)
+    model.learn(n_rounds * model.rollout_size * model.n_clients, course)
+    every = n_rounds // 40
+    return {
+        "n_clients": n_clients, "algo": algo, "waiting": waiting, "seed": seed,
+        "rounds": list(range(0, n_rounds + 1, every)),
+        "seconds": [round(second) for second, _ in course.rows[::every]],
+        "returns": [round(value, 4) for _, value in course.rows[::every]],
+        "arrived": round(float(np.mean(course.arrived)), 1),
+        "staleness": round(float(np.nanmean(course.staleness)), 2),
+        "cpu_seconds": round(time.process_time() - started, 1),
+    }  # fmt: skip
+
+
+def run(clients: list[int], algos: list[str], seeds: list[int]) -> None:
+    done = json.loads(PATH.read_text()) if PATH.exists() else []
+    names = ("n_clients", "algo", "waiting", "seed")
+    finished = {tuple(cell[name] for name in names) for cell in done}
+    for seed, n_clients, algo, waiting in itertools.product(seeds, clients, algos, WAITING):
+        if (n_clients, algo, waiting, seed) in finished:
+            continue
+        done.append(run_cell(n_clients, algo, waiting, seed))
+        PATH.with_suffix(".part").write_text("[\n " + ",\n ".join(json.dumps(cell) for cell in done) + "\n]\n")
+        PATH.with_suffix(".part").replace(PATH)
+        cell = done[-1]
+        print(
+            f"{n_clients} {algo} {waiting} seed {seed}: {cell['returns'][-1]} after {cell['seconds'][-1]} s, "
+            f"{cell['arrived']} arrived, staleness {cell['staleness']}, {cell['cpu_seconds']} CPU s",
+            flush=True,
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--clients", type=int, nargs="+", default=[64, 256])
+    parser.add_argument("--algos", nargs="+", choices=ALGOS, default=list(ALGOS))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    arguments = parser.parse_args()
+    th.set_num_threads(1)
+    run(arguments.clients, arguments.algos, arguments.seeds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,207 @@
+"""Result files of runs, and the measures of a method over its seeds.
+
+A run's result file is ``<folder>/<family>-<label>/<method>-seed<seed>.json``: its ``summary.json``, and in files of
+``fedguide benchmark`` its complete hyperparameters (``config``) and ``versions`` as well.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_fedguide.benchmark.paper import PAPER_F
+
+#: CV is taken over so many rounds at the end of a run, all of which are evaluated.
+LAST_ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class Result:
+    """One finished run.
+
+    :param n_episodes: episodes per client in an evaluation
+    :param final: client-average return of the deployed policies after the last round
+    :param worst_client: the lowest client's return there
+    :param success: share of the episodes there that succeeded; ``None`` where the environments do not say
+    :param broadcast: client-average return of the policy that the server sent last; ``None`` where it sends none
+    :param curve: evaluated round to client-average return of the deployed policies
+    :param bytes_up: uploaded per round by all clients together
+    :param bytes_down: sent per round to all clients together
+    :param median_seconds: of the median round
+    :param config: hyperparameters; ``None`` where the file does not say
+    """
+
+    path: Path
+    method: str
+    family: str
+    seed: int
+    n_rounds: int
+    conf_file: str
+    metadata_hash: str
+    n_episodes: int
+    final: float
+    worst_client: float
+    success: float | None
+    broadcast: float | None
+    curve: Mapping[int, float]
+    bytes_up: float
+    bytes_down: float
+    median_seconds: float
+    config: Mapping[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Measures:
+    """One method on one family, over its seeds.
+
+    :param F: client-average return after the last round, mean over seeds; ``F_std`` its population deviation
+    :param W: its worst seed
+    :param CV: deviation over absolute mean of the last twenty rounds, averaged over seeds; ``None`` where it is not defined
+    :param worst_client: the lowest client's return, averaged over seeds
+    :param curve: asked-for round to client-average return, averaged over seeds; without those that were not evaluated
+    :param seconds_per_round: the fastest seed's median: other work on the machine only adds
+    :param paper_F: of the paper
+    """
+
+    method: str
+    seeds: tuple[int, ...]
+    F: float
+    F_std: float
+    W: float
+    CV: float | None
+    worst_client: float
+    success: float | None
+    broadcast: float | None
+    curve: Mapping[int, float]
+    bytes_up_per_round: float
+    bytes_down_per_round: float
+    seconds_per_round: float
+    paper_F: float | None
+
+
+def result_folder(folder: Path, family: str, label: str) -> Path:
+    """Where the result files of a family under a label are."""
+    return folder / f"{family}-{label}"
+
+
+def result_path(folder: Path, family: str, label: str, method: str, seed: int) -> Path:
+    """The result file of a run."""
+    return result_folder(folder, family, label) / f"{method}-seed{seed}.json"
+
+
+def read_result(path: Path) -> Result:
+    """:raises ValueError: if the file is damaged, or of a run that was not finished"""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        result = _result(path, content)
+    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path} is not the result of a run ({reason}); delete it to repeat the run") from None
+    if path.name != f"{result.method}-seed{result.seed}.json":
+        raise ValueError(
+            f"{path} holds the result of {result.method} with seed {result.seed}; give it that name, or delete it"
+        )
+    return result
+
+
+def _result(path: Path, content: dict[str, Any]) -> Result:
+    if content["finished"] is not True:
+        raise ValueError(f"it ended after {content['rounds_done']} of {content['n_rounds']} rounds")
+    deployed, rates = content["deployed"], content["deployed"].get("success_rates")
+    broadcast, rounds = content.get("broadcast"), int(content["rounds_done"])
+    config = content.get("config")
+    return Result(
+        path=path,
+        method=str(content["algo"]),
+        family=str(content["env"]),
+        seed=int(content["seed"]),
+        n_rounds=int(content["n_rounds"]),
+        conf_file=str(content["conf_file"]),
+        metadata_hash=str(content["metadata_hash"]),
+        n_episodes=int(deployed["n_episodes"]),
+        final=float(deployed["average"]),
+        worst_client=float(deployed["worst_client"]),
+        success=None if rates is None else float(np.mean(rates)),
+        broadcast=None if broadcast is None else float(broadcast["average"]),
+        curve={int(round): float(value) for round, value in deployed["curve"]},
+        bytes_up=float(content["bytes_up"]) / rounds,
+        bytes_down=float(content["bytes_down"]) / rounds,
+        median_seconds=float(content["seconds"]["median_round"]),
+        config=None if config is None else dict(config),
+    )
+
+
+def read_results(
+    folder: Path, family: str, label: str, methods: Sequence[str], seeds: Sequence[int] | None = None
+) -> dict[str, list[Result]]:
+    """The results that there are, by method in the given order, seeds ascending.
+
+    :param seeds: those to read; all by default
+    :raises ValueError: for a damaged file, and for runs of one folder with other clients or another number of rounds
+    """
+    found: dict[str, list[Result]] = {}
+    for method in methods:
+        pattern = re.compile(rf"{re.escape(method)}-seed(\d+)\.json")
+        there = result_folder(folder, family, label)
+        names = sorted(path.name for path in there.iterdir()) if there.is_dir() else []
+        numbers = sorted(int(match[1]) for name in names if (match := pattern.fullmatch(name)))
+        wanted = [seed for seed in numbers if seeds is None or seed in seeds]
+        if wanted:
+            found[method] = [read_result(result_path(folder, family, label, method, seed)) for seed in wanted]
+    everything = [result for results in found.values() for result in results]
+    for result in everything:
+        first = everything[0]
+        for name, what in (("n_rounds", "rounds"), ("metadata_hash", "clients"), ("n_episodes", "episodes")):
+            if getattr(result, name) != getattr(first, name):
+                raise ValueError(
+                    f"{result.path} and {first.path} cannot stand in one table: their {what} differ ({getattr(result, name)} "
+                    f"and {getattr(first, name)}); move one of them to the folder of another label"
+                )
+    return found
+
+
+def measure(results: Sequence[Result], at_rounds: Sequence[int] = ()) -> Measures:
+    """The measures of one method on one family.
+
+    :param results: one per seed
+    :param at_rounds: rounds of the curve to report as well
+    """
+    final = np.array([result.final for result in results])
+    success = [result.success for result in results if result.success is not None]
+    broadcast = [result.broadcast for result in results if result.broadcast is not None]
+    volatilities = [volatility(result) for result in results]
+    known = [value for value in volatilities if value is not None]
+    curves = [result.curve for result in results]
+    return Measures(
+        method=results[0].method,
+        seeds=tuple(result.seed for result in results),
+        F=float(final.mean()),
+        F_std=float(final.std()),
+        W=float(final.min()),
+        CV=float(np.mean(known)) if len(known) == len(results) else None,
+        worst_client=float(np.mean([result.worst_client for result in results])),
+        success=float(np.mean(success)) if len(success) == len(results) else None,
+        broadcast=float(np.mean(broadcast)) if len(broadcast) == len(results) else None,
+        curve={
+            round: float(np.mean([curve[round] for curve in curves]))
+            for round in at_rounds
+            if all(round in curve for curve in curves)
+        },
+        bytes_up_per_round=float(np.mean([result.bytes_up for result in results])),
+        bytes_down_per_round=float(np.mean([result.bytes_down for result in results])),
+        seconds_per_round=min(result.median_seconds for result in results),
+        paper_F=PAPER_F.get(results[0].family, {}).get(results[0].method),
+    )
+
+
+def volatility(result: Result) -> float | None:
+    """CV of one run: deviation over absolute mean of its last twenty rounds; ``None`` for one round, and for a mean of 0."""
+    last = [value for round, value in result.curve.items() if round > result.n_rounds - LAST_ROUNDS]
+    mean = abs(float(np.mean(last))) if len(last) > 1 else 0.0
+    return float(np.std(last)) / mean if mean > 0 else None

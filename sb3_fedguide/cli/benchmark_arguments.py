@@ -1,0 +1,114 @@
+"""The flags of ``fedguide benchmark``: those of the training command for its runs, and its own. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_fedguide.algorithms import ALGORITHMS
+from sb3_fedguide.cli.arguments import OneLineParser, train_parser
+from sb3_fedguide.cli.names import check_names, nearest
+
+#: Flags of the training command that say what a run computes, and that a run which goes on has in its own settings.
+SETTINGS = ("dataset", "rounds", "n_envs_per_client", "conf_file", "hyperparams")
+#: Other flags of the training command.
+PASSED_ON = ("gym_packages", "cache_dir", "eval_freq", "eval_episodes", "save_freq", "device")
+ENGINES = ("local", "ray")
+
+
+def benchmark_parser(prog: str) -> OneLineParser:
+    """Parser of the command."""
+    parser = OneLineParser(
+        prog=prog,
+        allow_abbrev=False,
+        description="Train methods on families with seeds, one result file per run, and print tables of the results. Runs "
+        "that have their result are not repeated, those that were interrupted go on.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    flag = parser.add_argument
+    flag("--algos", nargs="+", metavar="ALGO", help=f"methods; by default all: {', '.join(ALGORITHMS)}")
+    flag("--envs", nargs="+", default=[], metavar="FAMILY", help="families of client environments, such as HopperHard")
+    flag("--metadata", nargs="+", default=[], metavar="FILE", help="metadata files of families of your own")
+    flag("--seeds", nargs="+", type=int, metavar="N", help="by default 0 1 2 3 4, and with --table-only all that there are")
+    for action in train_parser(prog)._actions:
+        if action.dest in SETTINGS + PASSED_ON:
+            parser._add_action(action)
+    flag("-f", "--folder", default="runs/benchmark", metavar="DIR", help="results are written to "
+         "DIR/FAMILY-LABEL/ALGO-seedN.json, and runs keep what they need to go on in DIR/FAMILY-LABEL/runs")  # fmt: skip
+    flag("--label", help="name of the results; by default the configuration's")
+    flag("--keep-runs", action="store_true", help="keep the folders of finished runs: models, TensorBoard events")
+    flag(
+        "--processes", type=int, metavar="K", help="runs at a time; by default 1, and with Ray as many as the cluster has CPUs"
+    )
+    flag("--engine", default="local", choices=ENGINES, help="where runs are done: in processes here, or as tasks of Ray")
+    flag("--address", "--ray-address", metavar="HOST:PORT", help="Ray cluster; by default "
+         "$RAY_ADDRESS, the one that runs here, or a new one")  # fmt: skip
+    flag("--table-only", action="store_true", help="do no runs, print what there is")
+    flag("--at-rounds", nargs="*", type=int, default=[25, 50], metavar="N", help="rounds of the curve that tables show")
+    flag("--baseline", default="local", metavar="ALGO", help="method whose mean return scores 1 where several families are "
+         "aggregated")  # fmt: skip
+    for name in ("markdown", "json", "csv"):
+        flag(f"--{name}", nargs="?", const="-", metavar="FILE", help=f"write the tables as {name} to FILE, or to the terminal")
+    return parser
+
+
+def parse_benchmark(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
+    """Parse, and refuse what the flags alone show to be wrong."""
+    parser = benchmark_parser(prog)
+    arguments, unknown = parser.parse_known_args(argv)
+    if unknown:
+        options = [option for action in parser._actions for option in action.option_strings]
+        parser.error(f"unknown argument {unknown[0]!r}.{nearest(unknown[0].split('=')[0], options)}")
+    try:
+        _check(arguments)
+    except ValueError as error:
+        parser.error(str(error))
+    arguments.label = arguments.label if arguments.label is not None else Path(arguments.conf_file).stem
+    if not re.fullmatch(r"[\w.+=-]+", arguments.label):
+        parser.error(f"--label {arguments.label!r} is to be part of a folder's name: letters, digits and . _ + = - only")
+    return arguments
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    if not arguments.envs and not arguments.metadata:
+        raise ValueError("give the families with --envs FAMILY ..., or --metadata FILE ...")
+    for flag, values in (("--algos", arguments.algos), ("--envs", arguments.envs), ("--seeds", arguments.seeds)):
+        if repeated := [value for value, count in Counter(values or ()).items() if count > 1]:
+            raise ValueError(f"{flag} names {repeated[0]} twice")
+    if arguments.processes is not None and arguments.processes < 1:
+        raise ValueError(f"--processes must be at least 1, not {arguments.processes}")
+    if negative := [value for value in arguments.seeds or () if value < 0]:
+        raise ValueError(f"--seeds must not be negative, as {negative[0]} is: what is drawn at random cannot be gone on with")
+    if wrong := [value for value in arguments.at_rounds if value < 1]:
+        raise ValueError(f"--at-rounds counts from 1, but got {wrong[0]}")
+    if arguments.address is not None and arguments.engine != "ray":
+        raise ValueError("--address is that of a Ray cluster; give --engine ray as well")
+    files = [file for file in (arguments.markdown, arguments.json, arguments.csv) if file not in (None, "-")]
+    for file in files:
+        if not Path(file).absolute().parent.is_dir() or Path(file).is_dir():
+            raise ValueError(f"the tables cannot be written to {file}: {_reason(Path(file))}")
+
+
+def _reason(path: Path) -> str:
+    return "it is a folder" if path.is_dir() else f"there is no folder {path.parent}"
+
+
+def check_methods(arguments: argparse.Namespace) -> None:
+    """Against those that are known once the user's own are registered.
+
+    :raises ValueError: for an unknown one
+    """
+    check_names([*(arguments.algos or ()), arguments.baseline], ALGORITHMS, "algorithm")
+
+
+def train_flags(arguments: argparse.Namespace, names: Sequence[str]) -> list[str]:
+    """The flags ``names`` for the training command, with the values that they have here."""
+    flags: list[str] = []
+    for action in train_parser("")._actions:
+        value = getattr(arguments, action.dest, None) if action.dest in names else None
+        if value is not None and value != []:
+            flags += [action.option_strings[-1], *(map(str, value) if isinstance(value, list) else [str(value)])]
+    return flags

@@ -1,0 +1,153 @@
+"""Tables of a benchmark: on the terminal, as Markdown, JSON and CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from sb3_fedguide.cli.report import format_size
+
+if TYPE_CHECKING:
+    from sb3_fedguide.benchmark.aggregate import Aggregate
+    from sb3_fedguide.benchmark.results import Measures
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What a benchmark has found.
+
+    :param families: name of the results, such as ``HopperHard-tuned``, to one row per method
+    :param aggregates: methods over all families; empty for a single one
+    :param notes: what is to be said about them
+    """
+
+    families: Mapping[str, Sequence[Measures]]
+    aggregates: Sequence[Aggregate]
+    notes: Sequence[str]
+
+
+Row = dict[str, str]
+
+
+def rows_of(measures: Sequence[Measures]) -> list[Row]:
+    """The cells of one family's table by column; columns that no method has a value for are left out."""
+    rounds = dict.fromkeys(round for row in measures for round in row.curve)
+    columns: dict[str, Callable[[Measures], str | None]] = {
+        "method": lambda row: row.method,
+        "seeds": lambda row: str(len(row.seeds)),
+        "F": lambda row: f"{row.F:.4g} ± {row.F_std:.3g}" if len(row.seeds) > 1 else f"{row.F:.4g}",
+        "worst client": lambda row: f"{row.worst_client:.4g}",
+        "W": lambda row: f"{row.W:.4g}",
+        "CV of the last 20 rounds": lambda row: _number(row.CV, ".3f"),
+        **{f"round {round}": partial(_at_round, round) for round in rounds},
+        "broadcast": lambda row: _number(row.broadcast, ".4g"),
+        "success": lambda row: _number(row.success, ".2f"),
+        "up, down per round": lambda row: f"{format_size(row.bytes_up_per_round)}, {format_size(row.bytes_down_per_round)}",
+        "s per round": lambda row: f"{row.seconds_per_round:.3g}",
+        "paper F": lambda row: _number(row.paper_F, "g"),
+    }
+    return _table(columns, measures)
+
+
+def aggregate_rows(aggregates: Sequence[Aggregate]) -> list[Row]:
+    """The cells of the table over all families, by column."""
+    families = dict.fromkeys(family for row in aggregates for family in row.scores)
+    columns: dict[str, Callable[[Aggregate], str | None]] = {
+        "method": lambda row: row.method,
+        "runs": lambda row: str(row.n_runs),
+        "IQM": lambda row: f"{row.iqm:.3f}",
+        "95 % interval": lambda row: None if row.interval is None else "{:.3f} to {:.3f}".format(*row.interval),
+        **{family: partial(_score, family) for family in families},
+    }
+    return _table(columns, aggregates)
+
+
+def _table(columns: Mapping[str, Callable[[Any], str | None]], rows: Sequence[Any]) -> list[Row]:
+    cells = {name: [cell(row) for row in rows] for name, cell in columns.items()}
+    shown = {name: [value or "-" for value in values] for name, values in cells.items() if any(values)}
+    return [dict(zip(shown, values, strict=True)) for values in zip(*shown.values(), strict=True)]
+
+
+def _at_round(round: int, row: Measures) -> str | None:
+    return _number(row.curve.get(round), ".4g")
+
+
+def _score(family: str, row: Aggregate) -> str:
+    return f"{row.scores[family]:.3f}"
+
+
+def _number(value: float | None, form: str) -> str | None:
+    return None if value is None else format(value, form)
+
+
+def print_tables(tables: Tables) -> None:
+    """On the terminal."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=None if Console().is_terminal else 160)
+    for title, rows in _titled(tables):
+        table = Table(title=title, title_justify="left")
+        for name in rows[0]:
+            table.add_column(name, justify="left" if name == "method" else "right")
+        for row in rows:
+            table.add_row(*row.values())
+        console.print(table)
+    for note in tables.notes:
+        console.print(note, highlight=False, soft_wrap=True)
+
+
+def _titled(tables: Tables) -> list[tuple[str, list[Row]]]:
+    titled = [(name, rows_of(measures)) for name, measures in tables.families.items()]
+    if tables.aggregates:
+        titled.append(("All families: normalised scores", aggregate_rows(tables.aggregates)))
+    return titled
+
+
+def markdown(tables: Tables) -> str:
+    """Headings and tables; the notes below them."""
+    lines: list[str] = []
+    for title, rows in _titled(tables):
+        lines += [f"## {title}", "", f"| {' | '.join(rows[0])} |", "|---" * len(rows[0]) + "|"]
+        lines += [*(f"| {' | '.join(row.values())} |" for row in rows), ""]
+    return "\n".join([*lines, *(f"* {note}" for note in tables.notes)]).rstrip() + "\n"
+
+
+def as_json(tables: Tables) -> str:
+    """Every figure in full precision; what is no finite number is ``null``."""
+    content = {
+        "families": {name: [asdict(row) for row in measures] for name, measures in tables.families.items()},
+        "aggregate": [asdict(row) for row in tables.aggregates],
+        "notes": list(tables.notes),
+    }
+    return json.dumps(_finite(content), indent=2, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def as_csv(tables: Tables) -> str:
+    """The families' tables, one row per family and method, in full precision; without the aggregate."""
+    records = []
+    for name, measures in tables.families.items():
+        for row in measures:
+            record = {"results": name, **asdict(row), "seeds": " ".join(map(str, row.seeds))}
+            curve = record.pop("curve")
+            records.append({**record, **{f"round_{round}": value for round, value in curve.items()}})
+    columns = dict.fromkeys(column for record in records for column in record)
+    file = io.StringIO()
+    writer = csv.DictWriter(file, list(columns), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(records)
+    return file.getvalue()

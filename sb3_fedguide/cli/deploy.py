@@ -1,0 +1,169 @@
+"""A federation over a network: its certificates and keys, its server, and its clients."""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import socket
+import ssl
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sb3_fedguide.cli.arguments import OneLineParser
+from sb3_fedguide.cli.run_folder import exclusive, write_json
+from sb3_fedguide.cli.signals import StopSignals
+
+if TYPE_CHECKING:
+    from sb3_fedguide.cli.deploy_config import ClientDeployment
+
+EXIT_FAILED, EXIT_USAGE = 1, 2
+#: In a deployment's folder, what its processes are told.
+CONFIG = "config.json"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command.
+
+    :return: the exit code: 0, 1 where a part failed and trying again is of use, 2 for wrong input, 130 after an interrupt
+        (SIGINT), 143 after SIGTERM
+    """
+    arguments = _parser().parse_args(argv)
+    signals = StopSignals()
+    try:
+        _check_installation()
+        with signals:
+            return arguments.run(arguments)
+    except ValueError as error:
+        print(f"fedguide deploy: error: {error}", file=sys.stderr)
+        return EXIT_USAGE
+    except OSError as error:
+        where = "" if error.filename is None else f"{error.filename}: "
+        print(f"fedguide deploy: error: {where}{error.strerror or error}", file=sys.stderr)
+        return EXIT_FAILED
+    except KeyboardInterrupt:
+        return signals.exit_code
+
+
+def _parser() -> OneLineParser:
+    parser = OneLineParser(prog="fedguide deploy", allow_abbrev=False, description=f"{__doc__} See docs/deployment.md.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    certificates = commands.add_parser("certificates", help="make the server's certificate, and an authority if there is none")
+    certificates.add_argument("folder", type=Path, metavar="DIR", help="where ca.crt, ca.key, server.crt and server.key go")
+    certificates.add_argument("--host", action="append", required=True, metavar="NAME", help="name or address under which "
+                              "clients reach the server; can be given more than once")  # fmt: skip
+    certificates.add_argument("--days", type=int, default=825, help="how long the certificate holds (%(default)s)")
+    certificates.set_defaults(run=_certificates)
+    key = commands.add_parser("key", help="make a client's pair of keys, on the client's machine")
+    key.add_argument("folder", type=Path, metavar="DIR", help="where NAME and NAME.pub go")
+    key.add_argument("name", metavar="NAME", help="of the client, e.g. client_0")
+    key.set_defaults(run=_key)
+    server = commands.add_parser("server", help="run the server until the federation's last round")
+    server.add_argument("config", type=Path, metavar="CONFIG", help="YAML file, see docs/deployment.md")
+    server.set_defaults(run=_server)
+    client = commands.add_parser("client", help="run a client until the federation's last round")
+    client.add_argument("config", type=Path, metavar="CONFIG", help="YAML file, see docs/deployment.md")
+    client.set_defaults(run=_client)
+    return parser
+
+
+def _check_installation() -> None:
+    try:
+        from sb3_fedguide.flower.processes import check_flower_version
+    except ModuleNotFoundError as error:
+        raise ValueError(f"{error.name} is not installed: pip install 'sb3-fedguide[flower]'") from None
+    check_flower_version()
+
+
+def _certificates(arguments: argparse.Namespace) -> int:
+    from sb3_fedguide.flower.certificates import CA, write_certificates
+
+    if arguments.days < 1:
+        raise ValueError(f"--days must be at least 1, not {arguments.days}")
+    write_certificates(arguments.folder, arguments.host, arguments.days)
+    print(f"{arguments.folder}: give {CA} to every client, and nothing else")
+    return 0
+
+
+def _key(arguments: argparse.Namespace) -> int:
+    from sb3_fedguide.flower.certificates import write_key
+
+    private, public = write_key(arguments.folder, arguments.name)
+    print(f"{private} stays on this machine; the server needs {public}:\n{public.read_text().strip()}")
+    return 0
+
+
+def _server(arguments: argparse.Namespace) -> int:
+    from sb3_fedguide.cli.deploy_config import ServerDeployment
+    from sb3_fedguide.flower.server_node import ServerNode
+
+    deployment = ServerDeployment(arguments.config)
+    config = _prepare(deployment.folder)
+    with exclusive(deployment.folder):
+        write_json(config, deployment.told())
+        node = ServerNode(deployment.listen, deployment.certificates, deployment.keys, config, deployment.folder)
+        print(f"{deployment.server.n_clients} clients, {deployment.server.n_rounds} rounds, listening on "
+              f"{deployment.listen[0]}:{deployment.listen[1]}, writing to {deployment.folder}", flush=True)  # fmt: skip
+        return node.run()
+
+
+def _client(arguments: argparse.Namespace) -> int:
+    from sb3_fedguide.cli.deploy_config import ClientDeployment
+    from sb3_fedguide.cli.site_config import read_site_config
+    from sb3_fedguide.flower.client_node import ClientNode
+
+    deployment = ClientDeployment(arguments.config)
+    read_site_config(deployment.site)
+    _check_server(deployment)
+    config = _prepare(deployment.folder)
+    with exclusive(deployment.folder):
+        # What is wrong with it is said now; in another process, since forks cannot use a GPU that this one has used.
+        with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as processes:
+            processes.submit(_try_site, deployment).result()
+        write_json(config, deployment.told())
+        node = ClientNode(deployment.server, deployment.ca, deployment.key, config, deployment.folder)
+        print(f"client {deployment.site.get('client')} of {deployment.server}, writing to {deployment.folder}", flush=True)
+        node.run()
+        print("the federation has had its last round", flush=True)
+    return 0
+
+
+def _check_server(deployment: ClientDeployment) -> None:
+    """Say what Flower would not: it takes a server with the wrong certificate for one that is not there.
+
+    :raises ValueError: where ``ca`` holds no certificate
+    :raises ConnectionError: where somebody else answers
+    """
+    host, _ = deployment.address
+    try:
+        context = ssl.create_default_context(cafile=deployment.ca)
+    except ssl.SSLError:
+        raise ValueError(f"{deployment.ca} holds no certificate; it has to be the ca.crt of the server's machine") from None
+    try:
+        with (
+            socket.create_connection(deployment.address, timeout=10.0) as connection,
+            context.wrap_socket(connection, server_hostname=host),
+        ):
+            pass
+    except ssl.SSLCertVerificationError as error:
+        why = error.verify_message
+        raise ConnectionError(f"{deployment.server} is not the server that {deployment.ca} vouches for: {why}") from None
+    except OSError:
+        print(f"{deployment.server} does not answer yet; waiting for it", flush=True)
+
+
+def _try_site(deployment: ClientDeployment) -> None:
+    from sb3_fedguide.common.site import make_site
+    from sb3_fedguide.flower.client_app import SITE
+
+    make_site(deployment.site, deployment.folder / SITE)
+
+
+def _prepare(folder: Path) -> Path:
+    """Make a deployment's folder, for nobody else to look into; return the path of what its processes are told."""
+    folder.mkdir(parents=True, exist_ok=True)
+    os.chmod(folder, 0o700)
+    return folder / CONFIG

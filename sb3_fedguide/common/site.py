@@ -1,0 +1,312 @@
+"""A client's machine in a real federation: one client, its disk, and answers to the server's messages."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter, Logger
+
+import sb3_fedguide
+from fed_envs.plain_data import State, freeze, thaw
+from sb3_fedguide.algorithms import algorithm_name
+from sb3_fedguide.common.callbacks import RoundCallback
+from sb3_fedguide.common.checkpoint_files import newest_checkpoint, remove_leftovers, write_checkpoint
+from sb3_fedguide.common.evaluation import Evaluation, FederatedEvalCallback, evaluation_env
+from sb3_fedguide.common.faults import in_round
+from sb3_fedguide.common.federation import Federation
+from sb3_fedguide.common.parameters import take_prefix
+from sb3_fedguide.offline.trunk import TrunkTraining, observation_moments
+from sb3_fedguide.server.clients import WITH_SERVER, difference
+from sb3_fedguide.server.figures import ClientEvaluation
+from sb3_fedguide.server.payload import Payload
+from sb3_fedguide.server.transport import RUN, UNPREPARED, Message
+from sb3_fedguide.server.trunk import MOMENTS, TRUNK
+
+logger = logging.getLogger(__name__)
+
+Answer = tuple[Payload, dict[str, Any]]
+
+#: What a client has learned when the run is over, in its folder: see :meth:`Federation.export_parameters`.
+PARAMETERS = "parameters.npz"
+
+
+class Site:
+    """Answers the server's messages for one client; all that it remembers is in its folder after each of them.
+
+    So a new process for every message does as well as one that stays, and a message that comes twice is answered from the
+    disk. After an exception this object is of no more use: a new one goes on from the disk.
+
+    :param model: a federation of this one client, ``clients=[k]``, with its seed given and nothing learned yet
+    :param n_rounds: rounds of the whole run
+    :param folder: this client's own, for nothing else
+    :param eval_freq: rounds between evaluations, as in :class:`~sb3_fedguide.common.evaluation.FederatedEvalCallback`;
+        ``None`` for none
+    :param n_episodes: episodes of an evaluation
+    :param report: tell the server the round's log and the evaluations' returns; otherwise nothing but uploads leaves
+    :raises ValueError: for a model of several clients, or a folder with another client's or another run's state
+    """
+
+    def __init__(
+        self,
+        model: Federation,
+        n_rounds: int,
+        folder: str | Path,
+        eval_freq: int | None = 5,
+        n_episodes: int = 10,
+        report: bool = True,
+    ) -> None:
+        if model.n_clients != 1:
+            raise ValueError(
+                f"a site holds one client, but this model holds {model.client_ids}; make it with clients=[k], and a site with "
+                "a folder of its own for each of them"
+            )
+        self.model, self.n_rounds, self.folder = model, n_rounds, Path(folder)
+        self.client_id = model.client_ids[0]
+        model.strategy = None  # it is on the server
+        self._log = _LastLog()
+        model.set_logger(Logger(None, [self._log]))
+        self._report = report
+        self._evaluation = None if eval_freq is None or not report else _SiteEvaluation(n_rounds, eval_freq, n_episodes)
+        self._learning: tuple[BaseCallback, list[RoundCallback]] | None = None
+        self._trunk: TrunkTraining | None = None
+        #: what :meth:`Pretraining.trunk_training` took
+        self._trunk_arguments: dict[str, Any] = {}
+        #: the run of the server that this client takes part in
+        self.run: str | None = None
+        #: messages that were answered
+        self.n_answered = 0
+        #: number of the server's last broadcast that arrived here
+        self.n_received = 0
+        self._reply: Message | None = None
+        self._is_usable = True
+        self._load()
+
+    @property
+    def prepared(self) -> bool:
+        """Whether this client has been through the offline stage."""
+        return self.model.pretrained
+
+    def facts(self) -> dict[str, Any]:
+        """What this client says of itself when it joins."""
+        model = self.model
+        obs_dim, action_dim = (space.shape[0] for space in (model.observation_space, model.action_space))  # type: ignore[index]
+        shapes = {"observations": [obs_dim], "actions": [action_dim], **model.upload_shapes()}
+        trunk = model.offline_stage().trunk_settings() if model.uses_prior else None
+        return {**self._identity(), "client": self.client_id, "shapes": shapes, "trunk": trunk}
+
+    def handle(self, message: Message) -> Message:
+        """Do what the server asks, and answer; the answer has the same kind and round.
+
+        Whatever it raises stays here: a transport sends :meth:`~sb3_fedguide.server.transport.Failure.of` instead.
+
+        :raises ValueError: for a message of another run
+        :raises RuntimeError: after an exception
+        """
+        if not self._is_usable:
+            raise RuntimeError("an error has left this client in the middle of a message; a new Site goes on from the disk")
+        if self.run not in (None, message.facts[RUN]):
+            raise ValueError(
+                f"{self.folder} holds the state of another run of the server; give this client a new folder for a new run"
+            )
+        reply = self._reply
+        if reply is not None and (reply.kind, reply.round) == (message.kind, message.round):
+            return reply
+        if message.kind == "join":
+            return self._join(message)
+        if message.kind in ("round", "finish") or (message.kind == "setup" and message.round > 0):
+            if not self.prepared:
+                return Message(message.kind, message.round, facts={UNPREPARED: True})
+        self._is_usable = False
+        self.run = message.facts[RUN]
+        answer = {
+            "moments": self._moments, "trunk": self._train_trunk, "setup": self._set_up, "round": self._play_round,
+            "finish": self._finish,
+        }[message.kind]  # fmt: skip
+        payload, facts = answer(message)
+        self._reply = Message(message.kind, message.round, payload, facts)
+        self.n_answered += 1
+        self._save()
+        self._is_usable = True
+        return self._reply
+
+    def _join(self, message: Message) -> Message:
+        """Nothing of it stays: a client that is refused can be put right in the same folder."""
+        facts = self.facts()
+        if other := difference(facts, message.facts, WITH_SERVER, "the server's"):
+            logger.warning("the server will refuse client %d: %s", self.client_id, other)
+        return Message("join", message.round, facts=facts)
+
+    def _moments(self, message: Message) -> Answer:
+        stage = self.model.offline_stage()
+        (data,), (n_updates,) = stage.datasets(), stage.trunk_updates()
+        return observation_moments(data.observations), {"n_updates": n_updates}
+
+    def _train_trunk(self, message: Message) -> Answer:
+        if self._trunk is None:
+            moments = take_prefix(message.payload, MOMENTS)
+            self._begin_trunk({"mean": moments["mean"], "std": moments["std"], "n_updates": message.facts["n_updates"]})
+        assert self._trunk is not None
+        if trunk := take_prefix(message.payload, TRUNK):
+            self._trunk.receive(trunk)
+        self._trunk.n_done = message.facts["n_done"]  # who has missed something goes on with the others' learning rate
+        self._trunk.run(message.facts["average_every"])
+        return self._trunk.uploads()[0], {}
+
+    def _begin_trunk(self, arguments: dict[str, Any]) -> None:
+        self._trunk_arguments = arguments
+        self._trunk = self.model.offline_stage().trunk_training(**arguments)
+
+    def _set_up(self, message: Message) -> Answer:
+        if message.round == 0:
+            self.model.pretrain(trunk=message.payload or None)
+            self._trunk = None
+            self._learn()
+            return {}, {}
+        evaluations = self._receive(message)
+        return self.model.upload(0), {"evaluations": evaluations}
+
+    def _play_round(self, message: Message) -> Answer:
+        callbacks, hooks = self._learn()
+        evaluations, model = self._receive(message), self.model
+        # Every schedule follows the federation's rounds, whoever took part in them.
+        model.round = message.round - 1
+        model.num_timesteps = model.round * model.rollout_size
+        with in_round(message.round):
+            model.play_round(callbacks, hooks, log_interval=1)
+        if self._evaluation is not None and self._evaluation.is_due(message.round):
+            evaluations.append(self._evaluated("deployed", message.round))
+        return model.upload(0), {
+            "figures": self._log.figures if self._report else {},
+            "evaluations": evaluations,
+        }
+
+    def _finish(self, message: Message) -> Answer:
+        evaluations = self._receive(message)
+        self.model.export_parameters(self.folder / PARAMETERS)
+        return {}, {"evaluations": evaluations}
+
+    def _receive(self, message: Message) -> list[dict[str, Any]]:
+        """Take what the server sent, unless it came already; its evaluation, where one is due."""
+        number, after = message.facts["broadcast"], message.facts["after"]
+        if not message.payload or number <= self.n_received:
+            return []
+        self._learn()
+        self.model.receive(0, message.payload)
+        self.n_received = number
+        due = self._evaluation is not None and (after % self._evaluation.eval_freq == 0 or after == self.n_rounds)
+        return [self._evaluated("broadcast", after)] if due and after > 0 and self.model.sends_policy(after) else []
+
+    def _evaluated(self, policy: str, round: int) -> dict[str, Any]:
+        assert self._evaluation is not None
+        evaluation = self._evaluation.last[policy] if policy == "deployed" else self._evaluation.run()
+        successes = None if evaluation.successes is None else evaluation.successes[0].tolist()
+        returns, lengths = evaluation.returns[0].tolist(), evaluation.lengths[0].tolist()
+        return ClientEvaluation(self.client_id, round, policy, returns, lengths, successes).facts()
+
+    def _learn(self) -> tuple[BaseCallback, list[RoundCallback]]:
+        """Begin to learn, or go on, with the first message that needs it."""
+        if self._learning is None:
+            model = self.model
+            _, callbacks, hooks = model.start_learning(
+                self.n_rounds * model.rollout_size - model.num_timesteps,
+                [] if self._evaluation is None else [self._evaluation],
+                reset_num_timesteps=model._last_obs is None,
+            )
+            self._learning = callbacks, hooks
+        return self._learning
+
+    def _identity(self) -> dict[str, Any]:
+        model = self.model
+        return {
+            "algorithm": algorithm_name(type(model)),
+            "version": sb3_fedguide.__version__,
+            "seed": model.seed,
+            "n_rounds": self.n_rounds,
+            "rollout_size": model.rollout_size,
+            "settings": model.server_settings(),
+        }
+
+    def _save(self) -> None:
+        assert self._reply is not None
+        trunk = self._trunk and {"arguments": freeze(self._trunk_arguments), "training": self._trunk.save_state()}
+        state: State = {
+            "identity": freeze(self._identity()),
+            "run": self.run,
+            "n_received": self.n_received,
+            "reply": freeze(vars(self._reply)),
+            "trunk": trunk,
+            "model": self.model.save_state() if self.prepared else None,
+        }
+        write_checkpoint(self.folder, self.n_answered, state)
+
+    def _load(self) -> None:
+        """Take the state in the folder, if there is one.
+
+        :raises ValueError: where it is another client's or another run's
+        """
+        remove_leftovers(self.folder)
+        found = newest_checkpoint(self.folder)
+        if found is None:
+            return
+        path, state = found
+        identity = self._identity()
+        if other := difference(thaw(state["identity"]), identity, identity, "here"):
+            raise ValueError(f"{path} is of another run: {other}; give this one a folder of its own")
+        self.n_answered = int(path.stem.removeprefix("round_"))
+        self.run, self.n_received = state["run"], state["n_received"]
+        self._reply = Message(**thaw(state["reply"]))
+        if state["trunk"] is not None:
+            self._begin_trunk(thaw(state["trunk"]["arguments"]))
+            assert self._trunk is not None
+            self._trunk.load_state(state["trunk"]["training"])
+        if state["model"] is not None:
+            self.model.load_state(state["model"])
+
+
+class _SiteEvaluation(FederatedEvalCallback):
+    """Evaluates what is deployed; what the server sends comes with the next message, and its environments with their use."""
+
+    def _on_training_start(self) -> None:
+        pass
+
+    def _on_round_end(self) -> None:
+        pass
+
+    def run(self) -> Evaluation:
+        if not hasattr(self, "env"):
+            self.env = evaluation_env(self.model, self.n_episodes)
+        return super().run()
+
+
+class _LastLog(KVWriter):
+    """Keeps the numbers of the last log that was written."""
+
+    def __init__(self) -> None:
+        self.figures: dict[str, float] = {}
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        numbers = {key: value for key, value in key_values.items() if isinstance(value, (int, float, np.number))}
+        self.figures = {key: float(value) for key, value in numbers.items() if math.isfinite(value)}
+
+    def close(self) -> None:
+        pass
+
+
+def make_site(config: Mapping[str, Any], folder: str | Path) -> Site:
+    """The site that a client's own configuration describes.
+
+    :param config: see :class:`sb3_fedguide.cli.site_config.SiteConfig`
+    :param folder: for the client's state
+    :raises ValueError: for anything unknown, missing, of the wrong type or out of range
+    """
+    from sb3_fedguide.cli.site_config import make_client, read_site_config
+
+    checked = read_site_config(config)
+    model, n_rounds = make_client(checked)
+    return Site(model, n_rounds, folder, checked.eval_freq or None, checked.eval_episodes, checked.report)

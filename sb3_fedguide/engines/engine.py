@@ -1,0 +1,157 @@
+"""Training of groups of clients outside this process, one round at a time."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+
+from fed_envs.faults import ClientError
+from fed_envs.state import State
+from sb3_fedguide.common.callbacks import RoundCallback
+from sb3_fedguide.common.federation import Federation
+from sb3_fedguide.engines.client_axis import join_clients, take_clients
+from sb3_fedguide.engines.worker import Round, Trained, describe
+
+
+class EngineError(RuntimeError):
+    """A worker is lost, and the round cannot be completed."""
+
+
+class Engine(ABC):
+    """Divides the clients into groups that train at the same time; server, evaluation and log stay where they are.
+
+    Workers keep nothing between rounds: each round, a group's state goes to its worker and comes back trained. So a run has
+    the same results, checkpoints and files with every engine and any number of workers.
+
+        with Processes(2) as engine:
+            engine.attach(model)
+            model.learn(total_timesteps)
+
+    :param num_actors: groups of clients; no more than there are clients
+    """
+
+    def __init__(self, num_actors: int) -> None:
+        self.num_actors = num_actors
+        self.groups: list[list[int]] = []
+
+    def attach(self, model: Federation) -> None:
+        """Let the workers train ``model``'s clients from its next round on.
+
+        :raises ValueError: where the model or its environments cannot be sent to other processes
+        """
+        n_groups = min(self.num_actors, model.n_clients)
+        # Neighbours are often alike and as slow as each other, so that every n-th client makes groups of equal length.
+        self.groups = [list(range(first, model.n_clients, n_groups)) for first in range(n_groups)]
+        self._start([describe(model, group) for group in self.groups])
+        model.engine = self
+
+    @abstractmethod
+    def _start(self, blobs: Sequence[bytes]) -> None:
+        """Start one worker per group."""
+
+    @abstractmethod
+    def _train(self, rounds: dict[int, Round]) -> dict[int, Trained | ClientError]:
+        """Train the groups ``rounds.keys()`` at the same time.
+
+        :raises EngineError: for a worker that is lost
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """End all workers."""
+
+    def __enter__(self) -> Engine:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def train_round(self, model: Federation, callbacks: BaseCallback) -> bool:
+        """One round of ``model``'s clients that take part; afterwards it is as if they had trained here.
+
+        :raises ClientError: where a client's environment or policy broke
+        :raises EngineError: for a worker that is lost
+        :raises ValueError: for callbacks that count environment steps
+        """
+        _check_callbacks(callbacks)
+        callbacks.on_rollout_start()
+        model.complete_state()  # an absent group's is joined with those of the others
+        state = model.save_state()
+        steps_at_once = model._active_steps(model._federated_env())
+        parts = {k: _part(model, state, group) for k, group in enumerate(self.groups)}
+        active = [k for k, group in enumerate(self.groups) if model.present[group].any()]
+        trained = self._train({k: Round(parts[k], model._total_timesteps, steps_at_once) for k in active})
+        for reply in trained.values():
+            if isinstance(reply, ClientError):
+                raise reply
+        replies = {k: reply for k, reply in trained.items() if isinstance(reply, Trained)}
+        parts.update({k: reply.state for k, reply in replies.items()})
+        self._take(model, state, [parts[k] for k in range(len(self.groups))])
+        for k, reply in replies.items():
+            if reply.observations is not None:
+                model.rollout_buffer.observations[:, self.groups[k]] = reply.observations  # type: ignore[attr-defined]
+        self._record(model, replies)
+        callbacks.on_rollout_end()
+        return True
+
+    def _take(self, model: Federation, state: State, parts: Sequence[State]) -> None:
+        """Put the groups' states together in the model's order, and load them."""
+        trained = next(k for k, group in enumerate(self.groups) if model.present[group].any())
+        parts = [parts[trained], *parts[:trained], *parts[trained + 1 :]]  # shared entries are the first part's
+        groups = [self.groups[trained], *self.groups[:trained], *self.groups[trained + 1 :]]
+        order = [position for group in groups for position in group]
+        joined = join_clients(parts, shared_entries(model))
+        # Gradient steps that any client took part in: in each round, who begins later takes part until the end.
+        joined["attributes"]["_n_updates"] = max(part["attributes"]["_n_updates"] for part in parts)
+        joined = take_clients(joined, np.argsort(order).tolist(), model.n_clients, shared_entries(model))
+        # What belongs to the process and the server has not changed.
+        model.load_state({**joined, **{name: state[name] for name in ("identity", "strategy", "random")}})
+
+    def _record(self, model: Federation, replies: dict[int, Trained]) -> None:
+        """Log what the workers logged: clients' own values as they are, others averaged over those that took part."""
+        values: dict[str, list[tuple[float, int]]] = {}
+        excluded: dict[str, Any] = {}
+        for k, reply in replies.items():
+            n_present = int(model.present[self.groups[k]].sum())
+            for key, (value, outputs) in reply.figures.items():
+                values.setdefault(key, []).append((value, n_present))
+                excluded[key] = outputs
+        for key, entries in values.items():
+            model.logger.record(key, _combined(key, entries), exclude=excluded[key])
+
+
+def shared_entries(model: Federation) -> set[str]:
+    """Entries of its state that belong to no client."""
+    return {name for kind in type(model).__mro__ for name in vars(kind).get("shared_state", ())}
+
+
+def _part(model: Federation, state: State, group: Sequence[int]) -> State:
+    part = take_clients(state, group, model.n_clients, shared_entries(model))
+    clients = [model.client_ids[position] for position in group]
+    return {**part, "identity": {**state["identity"], "clients": clients}, "strategy": None}
+
+
+def _combined(key: str, entries: Sequence[tuple[float, int]]) -> float:
+    values = [value for value, _ in entries]
+    if key.startswith("time/") or key.endswith(("_max", "/n_updates")):
+        return max(values)
+    if key.endswith("_min"):
+        return min(values)
+    if len(set(values)) == 1:
+        return values[0]
+    return sum(value * weight for value, weight in entries) / sum(weight for _, weight in entries)
+
+
+def _check_callbacks(callback: BaseCallback) -> None:
+    if isinstance(callback, CallbackList):
+        for child in callback.callbacks:
+            _check_callbacks(child)
+    elif isinstance(callback, EventCallback) or not isinstance(callback, RoundCallback):
+        raise ValueError(
+            f"{type(callback).__name__} counts environment steps, and with an engine these happen in other processes: use a "
+            "RoundCallback, or train without an engine"
+        )

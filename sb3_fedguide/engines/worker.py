@@ -1,0 +1,105 @@
+"""One group of clients in a process of its own: it gets their state and trains them for a round."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import cloudpickle
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.logger import Logger
+
+from fed_envs import FederatedVecEnv
+from fed_envs.faults import ClientError
+from fed_envs.state import State
+from sb3_fedguide.common.federation import Federation
+
+
+class Round(NamedTuple):
+    """What a worker is told of a round.
+
+    :param state: of its clients
+    :param total_timesteps: of the whole training, all clients together
+    :param steps_at_once: environment steps that one step of the round counts, all clients together
+    """
+
+    state: State
+    total_timesteps: int
+    steps_at_once: int
+
+
+class Trained(NamedTuple):
+    """What comes back.
+
+    :param state: of its clients, after the round
+    :param figures: what was logged, with the outputs that each value is kept from
+    :param observations: what the actors saw, ``(n_steps, n_clients, n_envs, obs_dim)``; ``None`` off policy
+    """
+
+    state: State
+    figures: dict[str, tuple[float, Any]]
+    observations: np.ndarray | None
+
+
+class Worker:
+    """Keeps nothing between two rounds: any worker can go on with any group's state.
+
+    :param blob: what :func:`describe` returned for its clients
+    """
+
+    def __init__(self, blob: bytes) -> None:
+        th.set_num_threads(1)
+        kind, policy_class, source, positions, attributes = cloudpickle.loads(blob)
+        self.model: Federation = kind(policy_class, None, _init_setup_model=False)
+        env = FederatedVecEnv(source, attributes["n_envs_per_client"], [attributes["client_ids"][k] for k in positions])
+        vars(self.model).update(attributes)
+        vars(self.model).update(env=env, client_ids=env.client_ids)
+        env.seed(self.model.seed)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
+            self.model._setup_model()  # type: ignore[attr-defined]
+        self.model.strategy = None
+        self.callbacks = CallbackList([])
+
+    def train(self, round: Round) -> Trained | ClientError:
+        """One round of its clients; a fault of a client is returned, not raised."""
+        model = self.model
+        model.set_logger(Logger(None, []))
+        self.callbacks.init_callback(model)  # type: ignore[arg-type]
+        model.load_state(round.state)
+        model.take_part(model.present)
+        model._total_timesteps, model.steps_at_once = round.total_timesteps, round.steps_at_once
+        try:
+            model.train_locally(self.callbacks)
+        except ClientError as error:
+            return error
+        excluded = model.logger.name_to_excluded
+        figures = {key: (value, excluded[key]) for key, value in model.logger.name_to_value.items()}
+        buffer = getattr(model, "rollout_buffer", None)
+        return Trained(model.save_state(), figures, None if buffer is None else buffer.observations)
+
+
+def describe(model: Federation, positions: Sequence[int]) -> bytes:
+    """What a :class:`Worker` needs to be made of the clients at ``positions``; their state comes with each round.
+
+    :raises ValueError: where the environments' functions cannot be sent to another process
+    """
+    env = model._federated_env()
+    source = env.family if env.family is not None else env._factories
+    per_round = {*model._excluded_save_params(), "strategy", "present", "outdated", "_last_obs", "_last_episode_starts"}
+    learned = {name for kind in type(model).__mro__ for name in vars(kind).get("state_attributes", ())} - {
+        "seed",
+        "pretrained",
+    }
+    attributes = {
+        name: value
+        for name, value in vars(model).items()
+        if name not in per_round | learned and not isinstance(value, (th.nn.Module, th.optim.Optimizer))
+    }
+    try:
+        return cloudpickle.dumps((type(model), model.policy_class, source, list(positions), attributes))
+    except Exception as error:
+        raise ValueError(f"this federation cannot be sent to another process: {error}") from error

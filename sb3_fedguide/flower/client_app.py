@@ -1,0 +1,40 @@
+"""Flower's ClientApp: hands a message to the client's site, whose state is on this machine's own disk."""
+
+from __future__ import annotations
+
+import json
+import traceback
+from pathlib import Path
+
+from flwr.app import Context
+from flwr.app import Message as FlowerMessage
+from flwr.clientapp import ClientApp
+
+from sb3_fedguide.common.site import make_site
+from sb3_fedguide.flower.records import from_records, to_records
+from sb3_fedguide.server.transport import Failure, Message
+
+#: In the client's folder, all that the client itself remembers.
+SITE = "site"
+#: In the client's folder from the federation's end on.
+FINISHED = "finished"
+
+app = ClientApp()
+
+
+@app.train()
+def answer(message: FlowerMessage, context: Context) -> FlowerMessage:
+    """Answer one message. Of an exception, the name of its type is all that leaves this machine."""
+    reply: Message | Failure
+    try:
+        request = from_records(message.content)
+        if isinstance(request, Failure):
+            raise ValueError(f"the server sent a failure: {request.reason}")
+        told = json.loads(Path(str(context.node_config["config"])).read_text(encoding="utf-8"))
+        reply = make_site(told["site"], Path(told["folder"]) / SITE).handle(request)
+        if request.kind == "finish":
+            (Path(told["folder"]) / FINISHED).touch()
+    except Exception as error:
+        traceback.print_exc()
+        reply = Failure.of(error)
+    return FlowerMessage(to_records(reply), reply_to=message)

@@ -1,0 +1,87 @@
+"""Flower's own processes: how they are started, and that none stays behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+
+from flwr.supercore.interceptors import RuntimeVersionHttpInterceptor
+
+#: The deployment uses what is no public interface of Flower, and is tested with these releases only.
+FLOWER = "1.41."
+_GRACE_SECONDS = 10.0
+_START = """
+import sys
+from flwr.supercore.app_utils import start_parent_process_monitor
+start_parent_process_monitor(int(sys.argv.pop(1)))
+from {module} import {function}
+sys.argv[0] = "{function}"
+{function}()
+"""
+
+
+def check_flower_version() -> None:
+    """:raises ValueError: for another version of Flower than those that this package is tested with"""
+    found = version("flwr")
+    if not found.startswith(FLOWER):
+        raise ValueError(f"this package needs flwr {FLOWER}x, and flwr {found} is installed: pip install 'flwr~={FLOWER}0'")
+
+
+def environment(home: Path) -> dict[str, str]:
+    """Environment of a Flower process whose own files are in ``home``."""
+    return {"OMP_NUM_THREADS": "1", **os.environ, "FLWR_HOME": str(home)}
+
+
+def runtime_version(component: str) -> RuntimeVersionHttpInterceptor:
+    """What a client of Flower's HTTP interfaces says about itself."""
+    return RuntimeVersionHttpInterceptor(component_name=component)
+
+
+def free_port() -> int:
+    """A port of the loopback device that nobody listens on now."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+class FlowerProcess:
+    """A Flower command in a process group of its own, which ends with the context, and with this process however that ends.
+
+    :param module: where the command's function is, such as ``flwr.superlink.cli``, and ``function``, its name
+    :param arguments: of the command
+    :param env: environment
+    """
+
+    def __init__(self, module: str, function: str, arguments: Sequence[str], env: dict[str, str]) -> None:
+        start = _START.format(module=module, function=function)
+        command = [sys.executable, "-c", start, str(os.getpid()), *arguments]
+        self.process = subprocess.Popen(command, env=env, start_new_session=True, stdin=subprocess.DEVNULL)
+
+    @property
+    def exit_code(self) -> int | None:
+        """``None`` while it runs."""
+        return self.process.poll()
+
+    def __enter__(self) -> FlowerProcess:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._signal(signal.SIGTERM)
+        until = time.monotonic() + _GRACE_SECONDS
+        while self.process.poll() is None and time.monotonic() < until:
+            time.sleep(0.05)
+        self._signal(signal.SIGKILL)
+        self.process.wait()
+
+    def _signal(self, number: int) -> None:
+        try:
+            os.killpg(self.process.pid, number)
+        except ProcessLookupError:  # all of the group have ended
+            pass

@@ -1,0 +1,76 @@
+"""Flower's ServerApp: the round loop over Flower's Grid."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from flwr.app import Context
+from flwr.serverapp import Grid, ServerApp
+from tensorboard.summary import Writer
+
+from sb3_fedguide.flower.certificates import read_public_key
+from sb3_fedguide.flower.transport import FlowerTransport
+from sb3_fedguide.server.config import ServerConfig
+from sb3_fedguide.server.serve import TooFewClients, serve
+
+#: Environment variable with the path of what the server is told. Flower's own run configuration would go to the clients.
+CONFIG = "FEDGUIDE_SERVER_CONFIG"
+#: Exit code where trying again is of no use.
+EXIT_USAGE = 2
+
+logger = logging.getLogger(__name__)
+app = ServerApp()
+
+
+@app.main()
+def main(grid: Grid, context: Context) -> None:
+    """Run the federation's rounds to the end.
+
+    :raises SystemExit: with code 2 where the configuration or the folder is wrong, 1 where there were too few clients
+    """
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", force=True)
+    logging.getLogger("httpx").setLevel(logging.WARNING)  # it has a line for every request
+    logging.getLogger("flwr").propagate = False  # it writes to the terminal itself
+    told = json.loads(Path(os.environ[CONFIG]).read_text(encoding="utf-8"))
+    clients = {read_public_key(text): int(client) for client, text in told["clients"].items()}
+    log = RoundLog(Path(told["folder"]) / "tb")
+    try:
+        serve(ServerConfig(**told["server"]), FlowerTransport(grid, clients), told["folder"], log)
+    except TooFewClients as error:
+        logger.error("%s; the next start goes on from the last checkpoint", error)
+        sys.exit(1)
+    except ValueError as error:
+        logger.error("%s", error)
+        sys.exit(EXIT_USAGE)
+    finally:
+        log.close()
+
+
+class RoundLog:
+    """Writes every round's figures for TensorBoard, and a line for the journal.
+
+    :param folder: of the events
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._writer = Writer(str(folder))
+
+    def __call__(self, round: int, figures: Mapping[str, float]) -> None:
+        step = int(figures.get("time/total_timesteps", round))
+        for key, value in figures.items():
+            self._writer.add_scalar(key, value, step=step)
+        self._writer.flush()
+        shown = {
+            "clients": "federated/participants", "failed": "federated/failed", "rejected": "federated/rejected",
+            "reward": "rollout/ep_rew_mean", "evaluation": "eval/mean_reward", "seconds": "time/server_round",
+        }  # fmt: skip
+        values = [f"{name} {figures[key]:.4g}" for name, key in shown.items() if key in figures]
+        logger.info("round %d: %s", round, ", ".join(values))
+
+    def close(self) -> None:
+        self._writer.close()

@@ -1,0 +1,118 @@
+"""Warnings of a run that goes wrong, in the round in which it begins to: with whom, why, and what to try."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_fedguide.algorithms.fedguide import FedGuide
+from sb3_fedguide.common.callbacks import RoundCallback
+from sb3_fedguide.common.federated_ppo import FederatedPPO
+from sb3_fedguide.common.federation import Federation
+
+#: Importance weights of fewer effective states than this share of them have collapsed.
+LEAST_SAMPLE_SHARE = 0.01
+#: V_phi misleads below this: rounding alone makes a constant V_phi negative.
+LEAST_EXPLAINED_VARIANCE = -0.05
+#: Mean KL from the rollout's policy, in nats, over all minibatches of a round; healthy rounds were at 0.002 to 0.06.
+LARGEST_KL = 0.2
+#: A client whose largest mixture weight is above this has one expert.
+ONE_EXPERT = 0.99
+
+
+class Symptom(NamedTuple):
+    """Something that goes wrong with clients one by one.
+
+    :param key: what is logged of each client, after ``client_<k>/``
+    :param is_wrong: whether such a value is wrong; NaN is not
+    :param reason: what it means
+    :param remedy: what to try, given the model's settings
+    """
+
+    key: str
+    is_wrong: Callable[[float], bool]
+    reason: str
+    remedy: Callable[[Federation], str]
+
+
+def _dice_remedy(model: Federation) -> str:
+    assert isinstance(model, FedGuide)
+    remedies = [] if model.beta == "auto" else ['beta="auto", which gives V_phi no weight where it does not help']
+    remedies += [] if model.calibrate else ["calibrate=True"]
+    return ", ".join([*remedies, "more or better offline data", "or beta=1, which leaves V_phi out"])
+
+
+def _kl_remedy(model: Federation) -> str:
+    assert isinstance(model, FederatedPPO)
+    trust = ", a larger lambda_trust" if isinstance(model, FedGuide) else ""
+    return f"a smaller learning_rate, fewer n_epochs (now {model.n_epochs}){trust}, or normalize=True"
+
+
+SYMPTOMS = (
+    Symptom(
+        "effective_sample_share",
+        lambda share: share < LEAST_SAMPLE_SHARE,
+        "the importance weights have collapsed onto a few states, so that the prior term is noise",
+        lambda model: 'prior_loss="sample", which needs no weights',
+    ),
+    Symptom(
+        "explained_variance_dice",
+        lambda explained: explained < LEAST_EXPLAINED_VARIANCE,
+        "V_phi has a negative explained variance: as a baseline it is worse than a constant",
+        _dice_remedy,
+    ),
+    Symptom(
+        "approx_kl",
+        lambda kl: kl > LARGEST_KL,
+        "the KL from the policy that acted has exploded: the rollout says little about the policy it led to",
+        _kl_remedy,
+    ),
+)
+
+
+def routes_one_to_one(rows: np.ndarray) -> bool:
+    """Whether mixture weights are nearly a permutation: every client has one expert, and none has another's.
+
+    :param rows: ``(n_clients, n_experts)``, each summing to one
+    """
+    return (
+        len(rows) > 1 and bool((rows.max(axis=1) > ONE_EXPERT).all()) and len(set(rows.argmax(axis=1).tolist())) == len(rows)
+    )
+
+
+class HealthCallback(RoundCallback):
+    """Warns of what goes wrong with a run: once of each symptom and client, however long it lasts.
+
+    The values are those of the log, per client; nothing of the training changes. A run that was resumed warns again.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._told: set[tuple[str, int]] = set()
+
+    def _on_round_end(self) -> None:
+        for problem in self._problems():
+            warnings.warn(f"round {self.model.round}: {problem}", stacklevel=1)
+
+    def _problems(self) -> Iterator[str]:
+        model, logged = self.model, self.logger.name_to_value
+        for symptom in SYMPTOMS:
+            values = {client: float(logged.get(f"client_{client}/{symptom.key}", np.nan)) for client in model.client_ids}
+            ill = [k for k, value in values.items() if symptom.is_wrong(value) and (symptom.key, k) not in self._told]
+            if ill:
+                self._told |= {(symptom.key, client) for client in ill}
+                told = ", ".join(f"client {client} ({symptom.key} {values[client]:.3g})" for client in ill)
+                yield f"{told}: {symptom.reason}; try {symptom.remedy(model)}"
+        if (
+            isinstance(model, FedGuide)
+            and ("plan", 0) not in self._told
+            and routes_one_to_one(model.mixture_rows[model.present])
+        ):
+            self._told.add(("plan", 0))
+            yield (
+                "the transport plan is a permutation: every client keeps to an expert of its own, and nothing of priors is "
+                f"shared; try a larger eta (now {model.eta:g}), or an n_experts below the number of clients"
+            )

@@ -1,0 +1,137 @@
+"""Every method's strategy from its settings alone: what a model in process and a server without PyTorch both call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sb3_fedguide.algorithms import ALGORITHMS, algorithm
+from sb3_fedguide.common.seeding import Role, seed_sequence
+from sb3_fedguide.server.averaging import Averaging, averaged_prefixes, check_averaging
+from sb3_fedguide.server.ot_moe import OTMoE
+from sb3_fedguide.server.participants import check_fraction
+from sb3_fedguide.server.payload import DDPG_ACTOR, DDPG_CRITIC, PPO_ACTOR, PPO_CRITIC
+from sb3_fedguide.server.strategy import Composite, Strategy
+from sb3_fedguide.server.svrpg import SVRPG
+from sb3_fedguide.server.validation import UPLOAD_BOUND, check_bound
+
+Settings = Mapping[str, Any]
+#: Makes a strategy from complete settings, the number of clients and the federation's seed.
+Maker = Callable[[Settings, int, int], Strategy | None]
+
+#: What every server has to know; the defaults are those of the constructors of all federations.
+COMMON: dict[str, Any] = {"client_fraction": 1.0, "upload_bound": UPLOAD_BOUND}
+
+
+@dataclass(frozen=True)
+class Method:
+    """The server's side of a method.
+
+    :param make: see :data:`Maker`
+    :param defaults: its settings beside :data:`COMMON`, under the names that the model's constructor has for them
+    """
+
+    make: Maker
+    defaults: Mapping[str, Any]
+
+
+def _averaging(kind: type[Averaging], actor: tuple[str, ...], critic: tuple[str, ...]) -> Maker:
+    def make(settings: Settings, n_clients: int, seed: int) -> Strategy:
+        average, every, until = settings["average"], settings["average_every"], settings["average_until"]
+        check_averaging(average, every)
+        prefixes = averaged_prefixes(average, actor, critic)
+        return kind(prefixes, every, until, settings["aggregator"], settings["trim_fraction"])
+
+    return make
+
+
+def _experts(settings: Settings, n_clients: int, seed: int) -> Strategy:
+    n_experts = settings["n_experts"] or n_clients
+    return OTMoE(n_experts, settings["eta"], settings["cost"], settings["cost_scaling"], seed_sequence(seed, Role.SERVER))
+
+
+def _experts_and_actors(settings: Settings, n_clients: int, seed: int) -> Strategy:
+    check_averaging("actor", settings["average_every"])
+    return Composite([_experts(settings, n_clients, seed), Averaging(PPO_ACTOR, settings["average_every"])])
+
+
+_AVERAGING = {
+    "average": "all", "average_every": 1, "average_until": None, "aggregator": "mean", "trim_fraction": 0.25,
+}  # fmt: skip
+_EXPERTS = {"n_experts": None, "eta": 0.05, "cost": "score", "cost_scaling": "max"}
+_PPO_AVERAGING = Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), _AVERAGING)
+
+#: Command-line name of an algorithm to its server's side.
+METHODS: dict[str, Method] = {
+    "local": Method(lambda settings, n_clients, seed: None, {}),
+    "fedavg": _PPO_AVERAGING,
+    "fedprox": _PPO_AVERAGING,
+    "fedkl": _PPO_AVERAGING,
+    "fedsvrpgm": Method(_averaging(SVRPG, PPO_ACTOR, PPO_CRITIC), _AVERAGING),
+    "fedrl": Method(_averaging(Averaging, DDPG_ACTOR, DDPG_CRITIC), _AVERAGING),
+    "fedguide": Method(_experts, _EXPERTS),
+    "fedguide-p": Method(_experts, _EXPERTS),
+    "fedguide-a": Method(_experts_and_actors, {**_EXPERTS, "average_every": 5}),
+}
+
+
+def register_method(name: str, method: Method) -> None:
+    """Make the server's side of an algorithm of one's own known; its class then says ``server_method = name``.
+
+    :raises ValueError: for a name that means something else already
+    """
+    if METHODS.get(name, method) != method:
+        raise ValueError(f"the method {name!r} has a server's side already; choose another name")
+    METHODS[name] = method
+
+
+def find_method(name: str) -> Method:
+    """The server's side of an algorithm, by its command-line name.
+
+    Of an algorithm of one's own without one by its name, that which its class names; this imports the class and PyTorch.
+
+    :raises ValueError: for an unknown algorithm, or one whose class makes its strategy itself
+    """
+    if name in METHODS:
+        return METHODS[name]
+    if name not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm {name!r}; known are {', '.join(ALGORITHMS)}")
+    from sb3_fedguide.common.federation import Federation
+
+    cls = algorithm(name)
+    if cls._make_strategy is not Federation._make_strategy:
+        raise ValueError(
+            f"{cls.__name__} makes its strategy itself, which needs the model; give its server's side to "
+            "sb3_fedguide.server.build.register_method() and its name to the class's server_method"
+        )
+    return METHODS[cls.server_method]
+
+
+def complete_settings(algorithm: str, given: Settings) -> dict[str, Any]:
+    """All settings of a method's server, those not given by their defaults.
+
+    :raises ValueError: for a setting that the server does not have
+    """
+    settings = {**COMMON, **find_method(algorithm).defaults}
+    if unknown := sorted(given.keys() - settings.keys()):
+        raise ValueError(f"the server of {algorithm} has no setting {unknown[0]!r}; it has {', '.join(sorted(settings))}")
+    return {**settings, **given}
+
+
+def make_strategy(algorithm: str, settings: Settings, n_clients: int, seed: int) -> Strategy | None:
+    """The strategy of an algorithm; ``None`` where nothing is exchanged.
+
+    :param algorithm: command-line name
+    :param settings: hyperparameters that the server needs, under the names of the constructor's parameters
+    :param n_clients: clients of the federation
+    :param seed: the federation's
+    :raises ValueError: for unknown settings, or values out of range
+    """
+    complete = complete_settings(algorithm, settings)
+    check_fraction(complete["client_fraction"])
+    check_bound(complete["upload_bound"])
+    strategy = find_method(algorithm).make(complete, n_clients, seed)
+    if strategy is not None:
+        strategy.upload_bound = complete["upload_bound"]
+    return strategy

@@ -1,0 +1,126 @@
+"""Who belongs to a federation: who has joined with the same settings, who was refused and why, who is ready to train."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import sb3_fedguide
+from fed_envs.plain_data import State, freeze, thaw
+
+if TYPE_CHECKING:
+    from sb3_fedguide.server.serve import ServerConfig
+
+Facts = dict[str, Any]
+
+#: Of what client and server both state; it has to be the same.
+WITH_SERVER = ("algorithm", "version", "seed", "n_rounds", "rollout_size", "settings")
+#: Of what only clients know; it has to be what most of those say with whom the run began.
+AMONG_CLIENTS = ("shapes", "trunk")
+
+
+def server_facts(config: ServerConfig) -> Facts:
+    """What the server says of itself in its ``join`` message."""
+    return {
+        "algorithm": config.algorithm,
+        "version": sb3_fedguide.__version__,
+        "seed": config.seed,
+        "n_rounds": config.n_rounds,
+        "rollout_size": config.rollout_size,
+        "settings": config.all_settings,
+    }
+
+
+def difference(theirs: Mapping[str, Any], ours: Mapping[str, Any], names: Iterable[str], whose: str) -> str | None:
+    """The first of ``names`` in which two statements differ, in words; ``None`` where they agree.
+
+    :param whose: to whom ``ours`` belongs, such as ``"the server's"``
+    """
+    for name in names:
+        their, our = theirs.get(name), ours.get(name)
+        if their == our:
+            continue
+        if isinstance(their, Mapping) and isinstance(our, Mapping):
+            part = difference(their, our, sorted({*map(str, their), *our}), whose)
+            return f"{name}: {part}"
+        return f"its {name} is {_short(their)}, {whose} {_short(our)}"
+    return None
+
+
+class Clients:
+    """The clients by id.
+
+    :param facts: what the server says of itself
+    """
+
+    def __init__(self, facts: Facts) -> None:
+        self.facts = facts
+        #: what each client said that has joined
+        self.joined: dict[int, Facts] = {}
+        #: who was refused, and why
+        self.refused: dict[int, str] = {}
+        #: who has been through the offline stage
+        self.prepared: set[int] = set()
+        #: what clients have to have in common, known when the run has begun
+        self.common: Facts | None = None
+
+    def newcomers(self, there: Collection[int]) -> list[int]:
+        """Who has to be asked; a refused client is asked again when it has been away."""
+        self.refused = {client: reason for client, reason in self.refused.items() if client in there}
+        return sorted(set(there) - self.joined.keys() - self.refused.keys())
+
+    def join(self, client: int, facts: Facts) -> str | None:
+        """Take a client's answer.
+
+        :return: why the client is refused, if it is
+        """
+        kept = {name: facts.get(name) for name in (*WITH_SERVER, *AMONG_CLIENTS)}
+        reason = None if facts.get("client") == client else f"it says that it is client {_short(facts.get('client'))}"
+        reason = reason or difference(kept, self.facts, WITH_SERVER, "the server's")
+        if reason is None and self.common is not None:
+            reason = difference(kept, self.common, AMONG_CLIENTS, "the other clients'")
+        if reason is None:
+            self.joined[client] = kept
+        else:
+            self.refused[client] = reason
+        return reason
+
+    def agree(self, n_clients: int) -> dict[int, str]:
+        """Settle what clients have in common by what most say, if at least ``n_clients`` say so; the others are refused.
+
+        :return: why, by client
+        """
+        if self.common is not None or not self.joined:
+            return {}
+        said = {client: _text(facts) for client, facts in sorted(self.joined.items())}
+        usual, count = Counter(said.values()).most_common(1)[0]
+        if count < n_clients:
+            return {}
+        self.common = json.loads(usual)
+        odd = {
+            client: difference(self.joined[client], json.loads(usual), AMONG_CLIENTS, "most others'") or ""
+            for client, text in said.items()
+            if text != usual
+        }
+        for client, reason in odd.items():
+            del self.joined[client]
+            self.refused[client] = reason
+        return odd
+
+    def save_state(self) -> State:
+        return freeze({"joined": self.joined, "prepared": sorted(self.prepared), "common": self.common})
+
+    def load_state(self, state: State) -> None:
+        saved = thaw(state)
+        self.joined, self.prepared, self.common = saved["joined"], set(saved["prepared"]), saved["common"]
+
+
+def _text(facts: Facts) -> str:
+    return json.dumps({name: facts[name] for name in AMONG_CLIENTS}, sort_keys=True)
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."

@@ -1,0 +1,65 @@
+"""What the server of a real federation has to know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from sb3_fedguide.server.build import complete_settings
+from sb3_fedguide.server.participants import n_participants
+
+
+@dataclass(frozen=True)
+class ServerConfig:
+    """What a server has to know.
+
+    :param algorithm: command-line name
+    :param n_clients: clients of the whole federation; also the number of experts where the settings do not say it
+    :param n_rounds: rounds of the run
+    :param rollout_size: environment steps of a client in a round
+    :param seed: the federation's
+    :param settings: the method's hyperparameters on the server, see :data:`sb3_fedguide.server.build.METHODS`; those that are
+        not given have the constructors' defaults
+    :param timeout: seconds that a client may take for a round; ``None`` for no limit
+    :param setup_timeout: the same of everything before the first round, where behaviour cloning, priors and DICE are trained
+    :param start_clients: clients that are awaited before anything begins; by default all
+    :param min_clients: replies without which a round does not end: those missing are asked again
+    :param wait: seconds to wait for too few clients before
+        :class:`~sb3_fedguide.server.serve.TooFewClients` ends the run; 0 not to wait, ``None`` for
+        ever
+    :param poll: seconds between two looks at who is there
+    :raises ValueError: for values that do not fit
+    """
+
+    algorithm: str
+    n_clients: int
+    n_rounds: int
+    rollout_size: int
+    seed: int
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    timeout: float | None = None
+    setup_timeout: float | None = None
+    start_clients: int | None = None
+    min_clients: int = 1
+    wait: float | None = None
+    poll: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("n_clients", "n_rounds", "rollout_size", "min_clients"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
+        if not 1 <= self.n_start <= self.n_clients:
+            raise ValueError(f"start_clients={self.start_clients} must lie between 1 and n_clients={self.n_clients}")
+        present = n_participants(self.all_settings["client_fraction"], self.n_clients)
+        if self.min_clients > present:
+            raise ValueError(f"min_clients={self.min_clients}, but only {present} clients take part in a round")
+
+    @property
+    def n_start(self) -> int:
+        return self.n_clients if self.start_clients is None else self.start_clients
+
+    @property
+    def all_settings(self) -> dict[str, Any]:
+        """The method's settings with the defaults of those not given."""
+        return complete_settings(self.algorithm, self.settings)

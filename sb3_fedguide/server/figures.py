@@ -1,0 +1,141 @@
+"""What clients report of a round: their logs as one log, and their evaluations as one table."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+#: Columns of the table of evaluations, the same in process and over a network.
+EVALUATION_COLUMNS = (
+    "round", "timesteps", "policy", "client", "mean_return", "std_return", "mean_length", "success_rate",
+)  # fmt: skip
+
+POLICIES = ("deployed", "broadcast")
+
+
+@dataclass(frozen=True)
+class ClientEvaluation:
+    """One client's episodes with one policy.
+
+    :param policy: ``"deployed"``, after local training, or ``"broadcast"``, what the server sent after it
+    :param successes: whether each episode succeeded; ``None`` where the environment does not say
+    """
+
+    client: int
+    round: int
+    policy: str
+    returns: list[float]
+    lengths: list[int]
+    successes: list[bool] | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """As plain data; the client is known by who sends it."""
+        return {name: value for name, value in vars(self).items() if name != "client"}
+
+    def row(self, timesteps: int) -> tuple[Any, ...]:
+        """Of the table."""
+        rate = "" if self.successes is None else f"{np.mean(self.successes):.6g}"
+        mean, std, length = np.mean(self.returns), np.std(self.returns), np.mean(self.lengths)
+        return (self.round, timesteps, self.policy, self.client, f"{mean:.6g}", f"{std:.6g}", f"{length:.6g}", rate)
+
+
+def read_evaluations(client: int, facts: Mapping[str, Any]) -> list[ClientEvaluation]:
+    """The evaluations in a client's reply; what is no evaluation is left out."""
+    found = []
+    given = facts.get("evaluations")
+    for item in given if isinstance(given, list) else []:
+        try:
+            returns, lengths, successes = [float(value) for value in item["returns"]], item["lengths"], item["successes"]
+            evaluation = ClientEvaluation(
+                client,
+                int(item["round"]),
+                item["policy"],
+                returns,
+                [int(value) for value in lengths],
+                None if successes is None else [bool(value) for value in successes],
+            )
+        except (TypeError, KeyError, ValueError, OverflowError):
+            continue
+        whole = bool(returns) and all(map(math.isfinite, returns)) and evaluation.policy in POLICIES
+        if whole and all(len(values) == len(returns) for values in (lengths, successes or lengths)):
+            found.append(evaluation)
+    return found
+
+
+def merge_figures(facts: Mapping[int, Mapping[str, Any]]) -> dict[str, float]:
+    """One log of all clients': ``client_<k>/...`` is taken from client k, everything else averaged over those that say it.
+
+    Keys of evaluations are left out: :func:`evaluation_figures` makes them of the episodes.
+    """
+    merged: dict[str, float] = {}
+    shared: dict[str, list[float]] = {}
+    for client, own in sorted(facts.items()):
+        given = own.get("figures")
+        for key, value in given.items() if isinstance(given, dict) else ():
+            if not isinstance(key, str) or isinstance(value, bool) or not isinstance(value, int | float):
+                continue
+            if key.startswith(f"client_{client}/"):
+                merged[key] = float(value)
+            elif not key.startswith(("client_", "federated/", "eval/")):
+                shared.setdefault(key, []).append(float(value))
+    return {**{key: float(np.mean(values)) for key, values in shared.items()}, **merged}
+
+
+def evaluation_figures(evaluations: Iterable[ClientEvaluation]) -> dict[str, float]:
+    """The clients' average and the worst client, under the keys that a federation in process logs."""
+    figures: dict[str, float] = {}
+    by_policy: dict[str, list[ClientEvaluation]] = {}
+    for evaluation in evaluations:
+        by_policy.setdefault(evaluation.policy, []).append(evaluation)
+    if deployed := by_policy.get("deployed"):
+        means = [float(np.mean(evaluation.returns)) for evaluation in deployed]
+        figures["eval/mean_reward"], figures["eval/worst_client"] = float(np.mean(means)), min(means)
+        figures["eval/mean_ep_length"] = float(np.mean([np.mean(evaluation.lengths) for evaluation in deployed]))
+        rates = [float(np.mean(evaluation.successes)) for evaluation in deployed if evaluation.successes is not None]
+        if rates:
+            figures["eval/success_rate"] = float(np.mean(rates))
+    if broadcast := by_policy.get("broadcast"):
+        figures["eval/broadcast_mean_reward"] = float(np.mean([np.mean(evaluation.returns) for evaluation in broadcast]))
+    return figures
+
+
+class EvaluationTable:
+    """A CSV of evaluations that is as long as the server's checkpoint says when a run goes on."""
+
+    def __init__(self, path: Path | None) -> None:
+        """:param path: ``None`` for no file"""
+        self.path = path
+
+    @property
+    def size(self) -> int:
+        """Bytes that are written."""
+        return self.path.stat().st_size if self.path is not None and self.path.exists() else 0
+
+    def cut(self, size: int) -> None:
+        """Forget what was written after the checkpoint: it will be written again."""
+        if self.path is not None and self.size > size:
+            os.truncate(self.path, size)
+
+    def add(self, evaluations: Iterable[ClientEvaluation], timesteps: Sequence[int]) -> None:
+        """Append rows, on the disk when this returns.
+
+        :param timesteps: of all clients together, after each round
+        """
+        rows = [evaluation.row(timesteps[evaluation.round - 1]) for evaluation in evaluations]
+        if self.path is None or not rows:
+            return
+        is_new = self.size == 0
+        with self.path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            if is_new:
+                writer.writerow(EVALUATION_COLUMNS)
+            writer.writerows(rows)
+            file.flush()
+            os.fsync(file.fileno())

@@ -1,0 +1,25 @@
+"""Who takes part in a round."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_fedguide.common.seeding import Role, stream
+
+
+def n_participants(client_fraction: float, n_clients: int) -> int:
+    """Clients in each round: the fraction of all, rounded, and at least one."""
+    return max(1, round(client_fraction * n_clients))
+
+
+def check_fraction(client_fraction: float) -> None:
+    """:raises ValueError: for a fraction outside (0, 1]"""
+    if not 0.0 < client_fraction <= 1.0:
+        raise ValueError(f"client_fraction={client_fraction} must lie in (0, 1]: it is the share of clients in each round")
+
+
+def draw_participants(seed: int, round: int, n_clients: int, n_present: int) -> np.ndarray:
+    """Who takes part in a round, ``(n_clients,)`` bool, drawn without replacement from the server's stream of that round."""
+    present = np.zeros(n_clients, dtype=bool)
+    present[stream(seed, Role.PARTICIPATION, round).choice(n_clients, n_present, replace=False)] = True
+    return present

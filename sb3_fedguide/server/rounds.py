@@ -1,0 +1,87 @@
+"""The server's part of a round, whatever carries the payloads: in process, worker processes or a network."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from sb3_fedguide.server.participants import draw_participants, n_participants
+from sb3_fedguide.server.payload import Payload
+from sb3_fedguide.server.strategy import Strategy
+
+
+class Rounds:
+    """Knows who has missed an exchange, counts bytes, and calls the strategy.
+
+    :param strategy: the method's; ``None`` where nothing is exchanged
+    """
+
+    def __init__(self, strategy: Strategy | None) -> None:
+        self.strategy = strategy
+        #: clients that have missed what others received, and have to catch up before they train again
+        self.outdated: set[int] = set()
+        #: bytes that all clients together have sent and received
+        self.bytes_up = 0
+        self.bytes_down = 0
+        #: figures of the last exchange, by log key
+        self.figures: dict[str, float] = {}
+
+    @property
+    def needs_setup(self) -> bool:
+        """Whether another exchange is needed before the first round."""
+        return self.strategy is not None and self.strategy.needs_setup
+
+    @property
+    def rejected(self) -> dict[int, str]:
+        """Clients whose uploads the last exchange rejected, and why."""
+        return {} if self.strategy is None else self.strategy.rejected
+
+    def catch_up(self, client: int) -> Payload:
+        """What a client receives before it trains again that is :attr:`outdated`, which it then is no longer."""
+        self.outdated.discard(client)
+        payload = {} if self.strategy is None else self.strategy.catch_up(client)
+        self.bytes_down += payload_bytes({client: payload})
+        return payload
+
+    def exchange(self, round: int, uploads: Mapping[int, Payload], absent: Iterable[int] = ()) -> dict[int, Payload]:
+        """Hand the uploads to the strategy, and count.
+
+        :param round: 0 before the first round, h after the h-th
+        :param uploads: payload by client id
+        :param absent: everybody else who belongs to the federation
+        :return: broadcast by client id, for those that receive one
+        """
+        assert self.strategy is not None
+        missed = self.outdated & uploads.keys()  # they were busy with their uploads while others received something
+        broadcasts = self.strategy.exchange(round, uploads)
+        self.outdated -= {k for k in missed if k in broadcasts and broadcasts[k].keys() >= self.strategy.latest(k).keys()}
+        if any(broadcasts.values()):  # what the others received is what the absent and the rejected have missed
+            self.outdated |= {*absent, *self.strategy.rejected}
+        up, down = payload_bytes(uploads), payload_bytes(broadcasts)
+        self.bytes_up += up
+        self.bytes_down += down
+        self.figures = {f"federated/{key}": value for key, value in self.strategy.metrics.items()}
+        self.figures["federated/bytes_up"] = up
+        self.figures["federated/bytes_down"] = down
+        self.figures["federated/bytes_total"] = self.bytes_up + self.bytes_down
+        return broadcasts
+
+
+def participants(clients: Sequence[int], seed: int, round: int, client_fraction: float) -> list[int]:
+    """Who of those that are there takes part in a round.
+
+    :param clients: ids in ascending order
+    :param round: counted from 0
+    """
+    n_present = n_participants(client_fraction, len(clients))
+    if n_present == len(clients):
+        return list(clients)
+    present = draw_participants(seed, round, len(clients), n_present)
+    return [clients[position] for position in np.flatnonzero(present).tolist()]
+
+
+def payload_bytes(payloads: Mapping[int, Payload]) -> int:
+    """Size of all arrays of all clients' payloads, in bytes; what is no array, as in a wrong upload, has none."""
+    arrays = [array for payload in payloads.values() if isinstance(payload, Mapping) for array in payload.values()]
+    return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray | np.generic))

@@ -1,0 +1,387 @@
+"""The server of a real federation: its rounds over any :class:`~sb3_fedguide.server.transport.Transport`.
+
+It needs neither PyTorch nor environments nor the clients' metadata: the strategy, NumPy, and a folder for its checkpoints.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import uuid
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from fed_envs.plain_data import State, freeze, thaw
+from sb3_fedguide.common.checkpoint_files import newest_checkpoint, remove_leftovers, write_checkpoint
+from sb3_fedguide.server.build import make_strategy
+from sb3_fedguide.server.clients import Clients, difference, server_facts
+from sb3_fedguide.server.config import ServerConfig
+from sb3_fedguide.server.figures import EvaluationTable, evaluation_figures, merge_figures, read_evaluations
+from sb3_fedguide.server.payload import Payload
+from sb3_fedguide.server.rounds import Rounds, participants, payload_bytes
+from sb3_fedguide.server.transport import RUN, UNPREPARED, Failure, Kind, Message, Transport
+from sb3_fedguide.server.trunk import TrunkAverages, moments_fault
+
+logger = logging.getLogger(__name__)
+
+#: What of the server a checkpoint holds as it is.
+_ATTRIBUTES = ("run_id", "round", "timesteps", "n_broadcasts", "n_setups", "outbox", "finished")
+__all__ = ["Server", "ServerConfig", "TooFewClients", "serve"]
+
+CHECKPOINTS = "checkpoints"
+EVALUATIONS = "evaluations.csv"
+
+#: Called after every round with its number and its log.
+RoundHook = Callable[[int, Mapping[str, float]], None]
+
+
+class TooFewClients(RuntimeError):
+    """Fewer clients than a round needs; with a folder, the same call goes on from its checkpoint."""
+
+
+def serve(
+    config: ServerConfig, transport: Transport, folder: str | Path | None = None, on_round: RoundHook | None = None
+) -> Server:
+    """Run a federation to its end, from its checkpoint where there is one.
+
+    :param folder: where checkpoints and the table of evaluations are kept; ``None`` for neither
+    :param on_round: called after every round with the log of that round: what clients report under ``client_<k>/``, their
+        averages, and the server's own figures under ``federated/``; once more after the last round where clients evaluated
+        what it sent
+    :return: the server as it is at the end
+    :raises TooFewClients: see :class:`ServerConfig`
+    :raises ClientError: where nothing that clients send before the first round can be used
+    :raises ValueError: for the checkpoint of another federation
+    """
+    server = Server(config, transport, folder, on_round)
+    server.run()
+    return server
+
+
+class Server:
+    """A federation's server; :func:`serve` makes and runs one."""
+
+    def __init__(
+        self,
+        config: ServerConfig,
+        transport: Transport,
+        folder: str | Path | None = None,
+        on_round: RoundHook | None = None,
+    ) -> None:
+        self.config, self.transport, self.on_round = config, transport, on_round
+        self.folder = None if folder is None else Path(folder)
+        strategy = make_strategy(config.algorithm, config.settings, config.n_clients, config.seed)
+        #: the strategy, who is outdated, and bytes
+        self.rounds = Rounds(strategy)
+        #: who has joined, who was refused, who is ready to train
+        self.clients = Clients(server_facts(config))
+        #: who was there at the last look
+        self.there: set[int] = set()
+        self.trunk: TrunkAverages | None = None
+        #: complete rounds
+        self.round = 0
+        #: environment steps of all clients together, after each round
+        self.timesteps: list[int] = []
+        #: exchanges in which clients received something
+        self.n_broadcasts = 0
+        #: what clients have not yet confirmed: number of the broadcast, the round it came after (0 for none), arrays
+        #: tells this run from others with the same settings
+        self.run_id = uuid.uuid4().hex
+        self.outbox: dict[int, tuple[int, int, Payload]] = {}
+        #: requests that failed since the last round, by client
+        self.failures: dict[int, str] = {}
+        self.n_setups = 0
+        self.finished = False
+        self._table = EvaluationTable(None if self.folder is None else self.folder / EVALUATIONS)
+
+    def run(self) -> None:
+        """See :func:`serve`."""
+        self._resume()
+        self._await_clients()
+        self._pretrain_trunk()
+        self._prepare()
+        while self.rounds.needs_setup:
+            self._set_up()
+        while self.round < self.config.n_rounds:
+            self._play_round()
+        if not self.finished:
+            self._finish()
+
+    def _await_clients(self) -> None:
+        """Until enough clients with the same settings are there to begin."""
+        started = time.monotonic()
+        while self.clients.common is None:
+            self._welcome()
+            self._refuse(self.clients.agree(self.config.n_start))
+            if self.clients.common is None:
+                self._pause(started, len(self.clients.joined), self.config.n_start)
+
+    def _welcome(self) -> None:
+        """Look who is there, and ask those who are new for their settings."""
+        self.there = set(self.transport.clients())
+        newcomers = self.clients.newcomers(self.there)
+        requests = {client: Message("join", 0, facts=self.clients.facts) for client in newcomers}
+        refused = {}
+        for client, reply in self._exchange(requests, self.config.timeout).items():
+            reason = self.clients.join(client, reply.facts)
+            if reason is not None:
+                refused[client] = reason
+            else:
+                logger.info("client %d has joined", client)
+        self._refuse(refused)
+
+    def _refuse(self, reasons: Mapping[int, str]) -> None:
+        for client, reason in reasons.items():
+            logger.warning("client %d is refused: %s; put it right there, and let it come again", client, reason)
+
+    def _pretrain_trunk(self) -> None:
+        settings = self.clients.common["trunk"] if self.clients.common is not None else None
+        if settings is None:
+            return
+        bound, timeout = self.config.all_settings["upload_bound"], self.config.setup_timeout
+        if self.trunk is None:
+            replies = self._collect(lambda: self._to_joined(Message("moments", 0)), timeout, self._fault_of_moments)
+            self._count_trunk(replies, {})
+            n_updates = max(int(reply.facts["n_updates"]) for reply in replies.values())
+            moments = {client: reply.payload for client, reply in replies.items()}
+            self.trunk = TrunkAverages(moments, n_updates, int(settings["prior_average_every"]), bound)
+            self._save()
+        while not self.trunk.finished:
+            request = Message("trunk", self.trunk.n_averages + 1, self.trunk.payload(), self.trunk.facts())
+            members = self.trunk.clients
+            replies = self._collect(lambda: self._to_joined(request, members), timeout)  # noqa: B023 (called at once)
+            self._count_trunk(replies, request.payload)
+            self._reject(self.trunk.average({client: reply.payload for client, reply in replies.items()}), "part of the trunk")
+            self._save()
+
+    def _fault_of_moments(self, reply: Message) -> str | None:
+        assert self.clients.common is not None
+        n_updates, shape = reply.facts.get("n_updates"), self.clients.common["shapes"]["observations"]
+        if type(n_updates) is not int or n_updates < 1:
+            return "it does not say how long its data are to be trained on"
+        reason = moments_fault(reply.payload)
+        return reason or (None if list(reply.payload["mean"].shape) == shape else f"moments of {reply.payload['mean'].shape}")
+
+    def _to_joined(self, request: Message, members: Iterable[int] | None = None) -> dict[int, Message]:
+        self._welcome()
+        there = self.there & self.clients.joined.keys()
+        return {client: request for client in sorted(there if members is None else there & set(members))}
+
+    def _count_trunk(self, replies: Mapping[int, Message], sent: Payload) -> None:
+        self.rounds.bytes_up += payload_bytes({client: reply.payload for client, reply in replies.items()})
+        self.rounds.bytes_down += payload_bytes({client: sent for client in replies})
+
+    def _preparations(self) -> dict[int, Message]:
+        """Requests to those who have not been through the offline stage."""
+        request = Message("setup", 0, {} if self.trunk is None else self.trunk.payload())
+        return {client: message for client, message in self._to_joined(request).items() if client not in self.clients.prepared}
+
+    def _prepare(self) -> None:
+        """The local part of the offline stage."""
+        started = time.monotonic()
+        while True:
+            for client in self._exchange(self._preparations(), self.config.setup_timeout):
+                self._note_prepared(client)
+            if len(self._there()) >= self.config.min_clients:
+                return self._save()
+            self._pause(started, len(self._there()), self.config.min_clients)
+
+    def _set_up(self) -> None:
+        """One of the exchanges before the first round."""
+        self.n_setups += 1
+
+        def requests() -> dict[int, Message]:
+            self._welcome()
+            return self._to_prepared("setup", self.n_setups, self._there())
+
+        replies = self._collect(requests, self.config.setup_timeout)
+        self._aggregate(0, replies)
+        self._save()
+
+    def _play_round(self) -> None:
+        round, config = self.round + 1, self.config
+        started = time.perf_counter()
+
+        def requests() -> dict[int, Message]:
+            waiting = self._preparations()
+            there = self._there()
+            fraction = config.all_settings["client_fraction"]
+            chosen = participants(there, config.seed, round - 1, fraction) if there else []
+            return self._to_prepared("round", round, chosen) | waiting
+
+        replies = self._collect(requests, config.timeout)
+        figures = merge_figures({client: reply.facts for client, reply in replies.items()})
+        self.timesteps.append(config.rollout_size * len(replies) + (self.timesteps[-1] if self.timesteps else 0))
+        exchanged = time.perf_counter()
+        self._aggregate(round, replies)
+        self.round = round
+        figures |= self.rounds.figures
+        figures |= {f"client_{client}/rejected": 1.0 for client in self.rounds.rejected}
+        figures["federated/participants"], figures["federated/failed"] = len(replies), len(self.failures)
+        figures["time/exchange"], figures["time/total_timesteps"] = time.perf_counter() - exchanged, self.timesteps[-1]
+        figures["time/round"], figures["time/server_round"] = round, time.perf_counter() - started
+        self._report(round, replies, figures)
+        self.failures = {}
+
+    def _finish(self) -> None:
+        """Deliver what was sent last; who is away does without."""
+        self.there = set(self.transport.clients())
+        requests = self._to_prepared("finish", self.config.n_rounds, self._there())
+        replies = self._exchange(requests, self.config.timeout)
+        for client in replies:
+            self.outbox.pop(client, None)
+        self.finished = True
+        self._report(self.config.n_rounds, replies, {})
+
+    def _report(self, round: int, replies: Mapping[int, Message], figures: dict[str, float]) -> None:
+        """Keep what clients measured, call the hook, and write the checkpoint."""
+        evaluations = [
+            evaluation
+            for client, reply in sorted(replies.items())
+            for evaluation in read_evaluations(client, reply.facts)
+            if 0 < evaluation.round <= round
+        ]
+        self._table.add(evaluations, self.timesteps)
+        figures |= evaluation_figures(evaluations)
+        if self.on_round is not None and figures:
+            self.on_round(round, figures)
+        self._save()
+
+    def _aggregate(self, round: int, replies: Mapping[int, Message]) -> None:
+        if self.rounds.strategy is None:
+            return
+        uploads = {client: reply.payload for client, reply in replies.items()}
+        broadcasts = self.rounds.exchange(round, uploads, self.clients.prepared - uploads.keys())
+        self.n_broadcasts += any(broadcasts.values())
+        for client, broadcast in broadcasts.items():
+            if broadcast:
+                self.outbox[client] = (self.n_broadcasts, round, broadcast)
+        self._reject(self.rounds.rejected, "upload")
+
+    def _reject(self, reasons: Mapping[int, str], what: str) -> None:
+        for client, reason in reasons.items():
+            logger.warning("round %d: the server rejects the %s of client %d: %s", self.round + 1, what, client, reason)
+
+    def _there(self) -> list[int]:
+        """Who was there at the last look and is ready to train."""
+        return sorted(self.there & self.clients.prepared)
+
+    def _to_prepared(self, kind: Kind, round: int, clients: Iterable[int]) -> dict[int, Message]:
+        """Requests with what each client has missed."""
+        requests = {}
+        for client in clients:
+            if client in self.rounds.outdated:
+                self.outbox[client] = (self.n_broadcasts, 0, self.rounds.catch_up(client))
+            number, after, payload = self.outbox.get(client, (0, 0, {}))
+            requests[client] = Message(kind, round, payload, {"broadcast": number, "after": after})
+        return requests
+
+    def _collect(
+        self,
+        requests: Callable[[], dict[int, Message]],
+        timeout: float | None,
+        fault: Callable[[Message], str | None] | None = None,
+    ) -> dict[int, Message]:
+        """Replies of at least :attr:`ServerConfig.min_clients` clients; who is missing is asked again.
+
+        :param requests: makes the requests to those who are there now
+        :param fault: what is wrong with a reply that does not count, if anything
+        """
+        started, replies = time.monotonic(), {}
+        while True:
+            asked = {client: request for client, request in requests().items() if client not in replies}
+            for client, reply in self._exchange(asked, timeout, fault).items():
+                if asked[client].kind == "setup" and asked[client].round == 0:
+                    self._note_prepared(client)
+                else:
+                    replies[client] = reply
+                    self.outbox.pop(client, None)
+            if len(replies) >= self.config.min_clients:
+                return replies
+            self._pause(started, len(replies), self.config.min_clients)
+
+    def _exchange(
+        self, requests: Mapping[int, Message], timeout: float | None, fault: Callable[[Message], str | None] | None = None
+    ) -> dict[int, Message]:
+        """The replies that came; of the others it is noted why they did not."""
+        if not requests:
+            return {}
+        requests = {
+            client: replace(request, facts={**request.facts, RUN: self.run_id}) for client, request in requests.items()
+        }
+        answers, replies = self.transport.exchange(requests, timeout), {}
+        for client, request in requests.items():
+            answer = answers.get(client, Failure("gone"))
+            if isinstance(answer, Message):
+                if (answer.kind, answer.round) != (request.kind, request.round):
+                    answer = Failure(f"answered the request {answer.kind} {answer.round}")
+                elif not isinstance(answer.facts, dict):
+                    answer = Failure("its facts are no mapping")
+                elif answer.facts.get(UNPREPARED):
+                    self.clients.prepared.discard(client)
+                    answer = Failure("not prepared: its state is gone, or it is new")
+                elif fault is not None and (reason := fault(answer)):
+                    answer = Failure(f"its answer is of no use: {reason}")
+            if isinstance(answer, Message):
+                replies[client] = answer
+                continue
+            self.failures[client] = answer.reason
+            logger.warning("%s %d: client %d is left out (%s)", request.kind, request.round, client, answer.reason)
+        return replies
+
+    def _note_prepared(self, client: int) -> None:
+        self.clients.prepared.add(client)
+        if self.n_broadcasts > 0:  # it has missed what the others received
+            self.rounds.outdated.add(client)
+
+    def _pause(self, started: float, have: int, need: int) -> None:
+        """Wait before the next look.
+
+        :raises TooFewClients: where that is over
+        """
+        limit = self.config.wait
+        if limit is not None and time.monotonic() - started >= limit:
+            where = "before the first round" if self.round == 0 else f"after round {self.round}"
+            raise TooFewClients(f"{have} of the {need} clients that are needed {where}, after {limit:g} s of waiting")
+        time.sleep(self.config.poll)
+
+    def _save(self) -> None:
+        if self.folder is None:
+            return
+        state: State = {
+            "server": self.clients.facts,
+            "attributes": freeze({name: getattr(self, name) for name in _ATTRIBUTES}),
+            "outdated": sorted(self.rounds.outdated),
+            "bytes": [self.rounds.bytes_up, self.rounds.bytes_down],
+            "clients": self.clients.save_state(),
+            "strategy": None if self.rounds.strategy is None else self.rounds.strategy.save_state(),
+            "trunk": None if self.trunk is None else self.trunk.save_state(),
+            "table_size": self._table.size,
+        }
+        write_checkpoint(self.folder / CHECKPOINTS, self.round, state)
+
+    def _resume(self) -> None:
+        """Take the checkpoint, if there is one.
+
+        :raises ValueError: for that of another federation
+        """
+        if self.folder is None:
+            return
+        remove_leftovers(self.folder / CHECKPOINTS)
+        found = newest_checkpoint(self.folder / CHECKPOINTS)
+        if found is None:
+            return
+        path, state = found
+        if other := difference(state["server"], self.clients.facts, self.clients.facts, "this server's"):
+            raise ValueError(f"{path} is the checkpoint of another federation: {other}; give this one a folder of its own")
+        for name, value in thaw(state["attributes"]).items():
+            setattr(self, name, value)
+        self.rounds.outdated = set(state["outdated"])
+        self.rounds.bytes_up, self.rounds.bytes_down = state["bytes"]
+        self.clients.load_state(state["clients"])
+        if self.rounds.strategy is not None:
+            self.rounds.strategy.load_state(state["strategy"])
+        self.trunk = None if state["trunk"] is None else TrunkAverages.from_state(state["trunk"])
+        self._table.cut(state["table_size"])
+        logger.info("going on after round %d", self.round)

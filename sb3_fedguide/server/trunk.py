@@ -1,0 +1,127 @@
+"""The server's side of the trunk's federated pretraining: merged moments once, then averages. Needs nothing but NumPy."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fed_envs.faults import ClientError
+from fed_envs.plain_data import State, freeze, thaw
+from sb3_fedguide.server.payload import N_SAMPLES, Payload
+from sb3_fedguide.server.validation import check_uploads
+
+logger = logging.getLogger(__name__)
+
+#: How the names of what the server sends begin: merged observation moments, and the trunk's parameters.
+MOMENTS, TRUNK = "moments.", "trunk."
+
+
+def merge_moments(uploads: Sequence[Mapping[str, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of the union of the clients' data, from their moments alone (Chan et al. 1979)."""
+    if not uploads:
+        raise ValueError("merge_moments needs the moments of at least one client.")
+    count = float(uploads[0]["n_samples"])
+    mean, squares = uploads[0]["mean"], uploads[0]["var"] * count
+    for upload in uploads[1:]:
+        n = float(upload["n_samples"])
+        total = count + n
+        delta = upload["mean"] - mean
+        squares = squares + upload["var"] * n + delta**2 * (count * n / total)
+        mean = mean + delta * (n / total)
+        count = total
+    return mean, np.sqrt(squares / count)
+
+
+def average_uploads(uploads: Sequence[Mapping[str, np.ndarray]], n_samples: Sequence[int]) -> Payload:
+    """FedAvg: the mean of the clients' parameters, weighted by their samples, in float64."""
+    weights = np.asarray(n_samples, dtype=np.float64) / np.sum(n_samples)
+    return {
+        name: np.sum([w * upload[name].astype(np.float64) for w, upload in zip(weights, uploads, strict=True)], axis=0).astype(
+            np.float32
+        )
+        for name in uploads[0]
+    }
+
+
+def moments_fault(moments: Payload) -> str | None:
+    """What is wrong with a client's moments, if anything."""
+    arrays = [moments.get(name) for name in (N_SAMPLES, "mean", "var")]
+    if len(moments) != 3 or not all(isinstance(array, np.ndarray | np.generic) for array in arrays):
+        return "they are not n_samples, mean and var"
+    count, mean, var = map(np.asarray, arrays)
+    if any(array.dtype != np.float64 for array in (count, mean, var)) or not all(
+        np.isfinite(array).all() for array in (count, mean, var)
+    ):
+        return "they are not finite numbers of float64"
+    if count.ndim != 0 or count < 1 or count != np.floor(count) or mean.ndim != 1 or mean.shape != var.shape:
+        return f"their shapes are {count.shape}, {mean.shape} and {var.shape}, or there are no samples"
+    return "a variance is negative" if (var < 0).any() else None
+
+
+class TrunkAverages:
+    """Where the trunk's pretraining stands.
+
+    :param moments: of each client that takes part; who is not among them does not take part
+    :param n_updates: updates of each client
+    :param average_every: updates between two averages
+    :param upload_bound: as in :func:`~sb3_fedguide.server.validation.check_uploads`; ``None`` for no checks
+    """
+
+    def __init__(self, moments: Mapping[int, Payload], n_updates: int, average_every: int, upload_bound: float | None) -> None:
+        self.clients = sorted(moments)
+        self.n_samples = {client: int(moments[client][N_SAMPLES]) for client in self.clients}
+        self.mean, self.std = merge_moments([moments[client] for client in self.clients])
+        self.n_updates, self.average_every, self.upload_bound = n_updates, average_every, upload_bound
+        self.n_averages = 0
+        self.trunk: Payload = {}
+
+    @property
+    def n_done(self) -> int:
+        """Updates that are averaged already."""
+        return min(self.n_averages * self.average_every, self.n_updates)
+
+    @property
+    def finished(self) -> bool:
+        return self.n_done == self.n_updates
+
+    def payload(self) -> Payload:
+        """What a client continues from, or, at the end, what everyone begins with."""
+        moments = {f"{MOMENTS}mean": self.mean, f"{MOMENTS}std": self.std}
+        return moments | {TRUNK + name: array for name, array in self.trunk.items()}
+
+    def facts(self) -> dict[str, Any]:
+        """Where the clients' schedules have to stand."""
+        return {"n_updates": self.n_updates, "n_done": self.n_done, "average_every": self.average_every}
+
+    def average(self, uploads: Mapping[int, Payload]) -> dict[int, str]:
+        """Take the average of those uploads that pass the checks.
+
+        :return: the reason by client for every upload that was rejected
+        :raises ClientError: where none passes
+        """
+        rejected: dict[int, str] = {}
+        if self.upload_bound is not None:
+            sent = {client: self.trunk for client in uploads}
+            rejected = check_uploads(uploads, sent, bound=self.upload_bound)
+        accepted = [client for client in sorted(uploads) if client not in rejected]
+        if not accepted:  # whoever is asked again answers the same
+            reasons = "; ".join(f"client {client}, {reason}" for client, reason in rejected.items())
+            raise ClientError(
+                sorted(uploads), f"the server cannot average the trunk, because it rejects every upload: {reasons}"
+            )
+        self.trunk = average_uploads([uploads[c] for c in accepted], [self.n_samples[c] for c in accepted])
+        self.n_averages += 1
+        return rejected
+
+    def save_state(self) -> State:
+        return freeze(vars(self))
+
+    @classmethod
+    def from_state(cls, state: State) -> TrunkAverages:
+        """What :meth:`save_state` was called on."""
+        averages = cls.__new__(cls)
+        vars(averages).update(thaw(state))
+        return averages

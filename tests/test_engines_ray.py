@@ -1,0 +1,77 @@
+"""Ray actors on two nodes, and what happens when one of them is killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from sb3_fedguide import FedAvg, Local
+from tests.test_engines import assert_same_training
+from tests.test_env_state import CountingEnv
+
+pytestmark = pytest.mark.ray
+CLIENTS = [lambda target=target: CountingEnv(target) for target in (-0.3, 0.0, 0.3)]
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A head node for the driver without room for actors, and two nodes of one CPU each."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+    nodes = [made.add_node(num_cpus=2) for _ in range(2)]
+    made.wait_for_nodes()
+    yield made, nodes
+    ray.shutdown()
+    made.shutdown()
+
+
+def actor_facts(engine):
+    """Process and node of each actor."""
+    import ray
+
+    def facts(worker):
+        return os.getpid(), ray.get_runtime_context().get_node_id()
+
+    return ray.get([actor.__ray_call__.remote(facts) for actor in engine._actors])
+
+
+def test_actors_on_two_nodes_and_their_loss(cluster, small):
+    from sb3_fedguide.engines.ray_actors import RayActors
+
+    made, nodes = cluster
+    plain, model = (FedAvg("MlpPolicy", CLIENTS, **small) for _ in range(2))
+    per_round = 3 * small["rollout_size"]
+    plain.learn(3 * per_round)
+    with RayActors(2, made.address) as engine:
+        engine.attach(model)
+
+        def learn(rounds):
+            model.learn(rounds * per_round, reset_num_timesteps=model.round == 0)
+
+        learn(1)
+        before = actor_facts(engine)
+        assert len({node for _, node in before}) == 2  # spread over both
+        os.kill(before[0][0], signal.SIGKILL)
+        learn(1)
+        after = actor_facts(engine)
+        assert after[0][0] != before[0][0]
+        lost = next(node for node in nodes if node.node_id == after[1][1])
+        made.remove_node(lost, allow_graceful=False)
+        learn(1)
+        assert lost.node_id not in {node for _, node in actor_facts(engine)}
+    assert_same_training(plain, model)
+
+
+def test_an_error_of_the_worker_is_an_error_here(cluster, small):
+    from sb3_fedguide.engines.ray_actors import RayActors
+
+    model = Local("MlpPolicy", CLIENTS, **small)
+    with RayActors(2, cluster[0].address) as engine:
+        engine.attach(model)
+        engine.groups = [[0], [1, 2]]  # not those of the workers
+        with pytest.raises(ValueError, match="the state does not fit: its clients"):
+            model.learn(1)
