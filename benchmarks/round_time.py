@@ -1,7 +1,7 @@
 """Seconds per round of a lockstep federation beside as many SB3 PPO learners and beside the physics alone.
 
     python benchmarks/round_time.py --env HopperHard --repeats 5
-    python benchmarks/round_time.py --env HopperHard --n-envs-per-client 4
+    python benchmarks/round_time.py --env HopperHard --n-envs-per-client 4 --sb3-envs 1
 
 Each repeat runs, in turn and with the same settings, one round (rollout and ``train()``, no evaluation) of
 
@@ -13,7 +13,7 @@ Each repeat runs, in turn and with the same settings, one round (rollout and ``t
   states and controls of a round.
 
 Ratios are taken repeat by repeat, so that a change of the machine's speed meets both sides. Writes
-``benchmarks/results/round_time_<env>[_x<n>].json``.
+``benchmarks/results/round_time_<env>[_x<n>][_sb3x<n>].json``.
 """
 
 from __future__ import annotations
@@ -122,12 +122,13 @@ def federation(env: str, clients: Sequence[int] | None, rollout_size: int, n_env
 
 def measure(args: argparse.Namespace) -> dict[str, list[float]]:
     sizes = (args.rollout_size, args.n_envs_per_client)
+    theirs_sizes = (args.rollout_size, args.sb3_envs or args.n_envs_per_client)
     (ours,), (alone,) = federation(args.env, None, *sizes, args.num_threads), federation(args.env, None, *sizes)
     per_round = args.rollout_size * ours.n_clients
-    learners = sb3_learners(args.env, range(ours.n_clients), *sizes)
+    learners = sb3_learners(args.env, range(ours.n_clients), *theirs_sizes)
     timed_round([ours, alone], per_round)
     timed_round(learners, args.rollout_size)
-    theirs = TwoProcesses(args.env, ours.n_clients, *sizes)
+    theirs = TwoProcesses(args.env, ours.n_clients, *theirs_sizes)
     (halves,), engine = federation(args.env, None, *sizes), Processes(2)
     engine.attach(halves)
     timed_round([halves], per_round)
@@ -159,6 +160,7 @@ def main() -> None:
     parser.add_argument("--env", default="HopperHard")
     parser.add_argument("--rollout-size", type=int, default=4096)
     parser.add_argument("--n-envs-per-client", type=int, default=1, help="for SB3's learners as well")
+    parser.add_argument("--sb3-envs", type=int, help="environments of SB3's learners, if others")
     parser.add_argument("--num-threads", type=int, default=1, help="of the federation's simulators")
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
@@ -177,6 +179,7 @@ def main() -> None:
         )
     }
     suffix = f"_x{args.n_envs_per_client}" if args.n_envs_per_client > 1 else ""
+    suffix += f"_sb3x{args.sb3_envs}" if args.sb3_envs else ""
     suffix += f"_{args.num_threads}threads" if args.num_threads > 1 else ""
     all_seconds = {name: spread(values) for name, values in seconds.items()}
     write_result(f"round_time_{args.env}{suffix}", {"command": vars(args), "seconds": all_seconds, "ratios": ratios})

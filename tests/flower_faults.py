@@ -37,7 +37,7 @@ def _handle_wrongly(self: site.Site, message: Message) -> Message:
     if fault == "nan":
         return replace(reply, payload={name: np.full_like(array, np.nan) for name, array in reply.payload.items()})
     if fault == "shape":
-        return replace(reply, payload={name: np.zeros((2, 3), np.float32) for name in reply.payload})
+        return replace(reply, payload={**reply.payload, "log_std": np.zeros((2, 3), np.float32)})
     return reply
 
 

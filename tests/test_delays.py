@@ -14,6 +14,7 @@ from sb3_fedguide.cli.train import main
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.participation import ParticipationAdam, simulate_delays
+from sb3_fedguide.engines.processes import Processes
 from sb3_fedguide.server.averaging import Averaging
 from sb3_fedguide.server.delays import Delays, DelaySettings, delay_settings, parse_delays
 from sb3_fedguide.server.rounds import Rounds
@@ -406,6 +407,18 @@ def test_a_saved_model_goes_on_with_its_clock(tmp_path):
         simulate_delays(model, parse_delays("sync"))
     model.learn(64)  # a new training begins at second 0
     assert model.delays.rounds == 1
+
+
+def test_worker_processes_train_only_those_who_are_not_busy():
+    here, _ = trained(FedAvg, "async:tick=30,spread=1,dropout=0.2", 5)
+    apart = FedAvg("MlpPolicy", "Bandit2D", **SMALL)
+    simulate_delays(apart, parse_delays("async:tick=30,spread=1,dropout=0.2"))
+    with Processes(2) as engine:
+        engine.attach(apart)
+        apart.learn(5 * 64)
+    assert apart.round == 5 and apart.num_timesteps == here.num_timesteps and apart.delays.seconds == here.delays.seconds
+    for own, other in zip(here.policy.parameters(), apart.policy.parameters(), strict=True):
+        np.testing.assert_array_equal(own.detach(), other.detach())
 
 
 # --- the command line -----------------------------------------------------------------------------------------------------

@@ -13,9 +13,11 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 from sb3_fedguide import FedAvg, FedGuide, Local
 from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.common.evaluation import FederatedEvalCallback
+from sb3_fedguide.common.participation import simulate_delays
 from sb3_fedguide.monitoring.callbacks import TensorBoardCallback
 from sb3_fedguide.monitoring.charts import chart_layout
 from sb3_fedguide.monitoring.diagnostics import DiagnosticsCallback
+from sb3_fedguide.server.delays import parse_delays
 
 PAGE = Path(__file__).parents[1] / "docs" / "log_keys.md"
 ROUNDS = 2
@@ -50,6 +52,14 @@ class BrokenClient(FedAvg):
     def upload(self, index):
         payload = super().upload(index)
         return {name: np.full_like(array, np.nan) for name, array in payload.items()} if index == 1 else payload
+
+
+class Delayed(FedAvg):
+    """FedAvg whose clients take simulated time."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        simulate_delays(self, parse_delays("async"))
 
 
 class Keys(KVWriter):
@@ -91,6 +101,7 @@ def runs(tmp_path_factory) -> dict[tuple[str, int], tuple[Keys, dict]]:
             for algo, variants in SETTINGS.items()
             for number, arguments in enumerate(variants)
         }
+        found["delayed", 0] = run(Delayed, PPO, envs, tmp_path_factory.mktemp("delayed"))
     with pytest.warns(UserWarning, match="rejects the upload of client 1"):
         return {**found, ("broken", 0): run(BrokenClient, PPO, envs, tmp_path_factory.mktemp("broken"))}
 

@@ -284,14 +284,9 @@ class FedGuide(FederatedPPO):
         sizes = []
         for i, rng in self.present_streams(Role.PRIOR):
             chosen = np.sort(rng.choice(buffer.n_rows, n_states, replace=False))
-            log_prior = mixture_log_prob(
-                self.prior,
-                self.experts[i],
-                self.mixture_rows[i],
-                th.as_tensor(raw[i, chosen]),
-                th.as_tensor(actions[i, chosen]),
-                n_steps=self.density_steps,
-            ).numpy()
+            visited = th.as_tensor(raw[i, chosen]), th.as_tensor(actions[i, chosen])
+            mixture = self.prior, self.experts[i], self.mixture_rows[i]
+            log_prior = mixture_log_prob(*mixture, *visited, n_steps=self.density_steps).numpy()
             supported = (np.abs(actions[i, chosen]) <= bound).all(axis=1)
             drawn, size = importance_weights(log_prior - policy_log_probs[i, chosen], supported)
             weights[i, chosen] = drawn * (buffer.n_rows / n_states)
