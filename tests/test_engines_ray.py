@@ -66,6 +66,22 @@ def test_actors_on_two_nodes_and_their_loss(cluster, small):
     assert_same_training(plain, model)
 
 
+def test_a_cluster_that_is_not_there_is_refused_at_once(small):
+    from sb3_fedguide.engines.ray_actors import RayActors
+
+    model = Local("MlpPolicy", CLIENTS, **small)
+    with RayActors(2, "127.0.0.1:9") as engine, pytest.raises(ValueError, match=r"no Ray cluster at 127\.0\.0\.1:9"):
+        engine.attach(model)
+
+
+def test_more_actors_than_cpus_are_refused(cluster, small):
+    from sb3_fedguide.engines.ray_actors import RayActors
+
+    model = Local("MlpPolicy", CLIENTS * 3, **small)
+    with RayActors(9, cluster[0].address) as engine, pytest.raises(ValueError, match="each of 9 actors takes one"):
+        engine.attach(model)
+
+
 def test_an_error_of_the_worker_is_an_error_here(cluster, small):
     from sb3_fedguide.engines.ray_actors import RayActors
 

@@ -134,7 +134,7 @@ class Run:
         from sb3_fedguide.cli.recorder import CostCallback, DeployedCallback, RunEvalCallback, StopCallback
         from sb3_fedguide.cli.run_folder import CHECKPOINTS, EVALUATIONS
         from sb3_fedguide.common.checkpoint import CheckpointCallback
-        from sb3_fedguide.engines import make_engine
+        from sb3_fedguide.engines import EngineError, make_engine
 
         arguments, model = self.arguments, self.model
         self._costs, self._deployed, self._evaluation = CostCallback(), DeployedCallback(), None
@@ -153,7 +153,10 @@ class Run:
         engine = make_engine(arguments.engine, arguments.num_actors, arguments.ray_address)
         with ExitStack() as stack:
             if engine is not None:
-                stack.enter_context(engine).attach(model)
+                try:
+                    stack.enter_context(engine).attach(model)
+                except (ValueError, OSError) as error:  # no cluster at that address, or too small a one
+                    raise EngineError(f"--engine {arguments.engine}: {one_message(error)}") from error
             self._learn(callbacks)
 
     def _learn(self, callbacks: list[RoundCallback | None]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -11,6 +12,7 @@ from fed_envs.faults import ClientError
 from sb3_fedguide.engines.engine import Engine, EngineError
 from sb3_fedguide.engines.worker import Round, Trained, Worker
 
+_CONNECT_SECONDS = 10.0
 #: How long Ray may take to start an actor anew, on another node if its own is gone (17 s were seen).
 RESTART_SECONDS = 120.0
 
@@ -24,7 +26,7 @@ class RayActors(Engine):
     :param num_actors: actors; no more than there are clients. Each takes one CPU.
     :param address: of a running cluster, such as ``"auto"`` or ``"10.0.0.1:6379"``; a cluster on this machine is started if
         ``None``
-    :raises ValueError: where Ray is not installed
+    :raises ValueError: where Ray is not installed; from :meth:`attach`, where the cluster has fewer CPUs
     """
 
     def __init__(self, num_actors: int, address: str | None = None) -> None:
@@ -42,9 +44,14 @@ class RayActors(Engine):
     def _start(self, blobs: Sequence[bytes]) -> None:
         ray = self._ray
         if not ray.is_initialized():
+            _check_address(self.address)
             resources = {"num_cpus": max(self.num_actors, os.cpu_count() or 1)} if self.address is None else {}
             ray.init(self.address, include_dashboard=False, log_to_driver=False, logging_level="warning", **resources)
             self._started_ray = True
+        n_cpus = int(ray.cluster_resources().get("CPU", 0))
+        if n_cpus < len(blobs):
+            self.close()
+            raise ValueError(f"the Ray cluster has {n_cpus} CPUs and each of {len(blobs)} actors takes one; use fewer actors")
         environment = {"env_vars": {"OMP_NUM_THREADS": "1"}}
         actor = ray.remote(Worker).options(
             num_cpus=1, max_restarts=-1, max_task_retries=0, scheduling_strategy="SPREAD", runtime_env=environment
@@ -79,3 +86,17 @@ class RayActors(Engine):
         if self._started_ray:
             self._ray.shutdown()
             self._started_ray = False
+
+
+def _check_address(address: str | None) -> None:
+    """Ray itself tries for minutes to reach a cluster that is not there.
+
+    :raises ValueError: where nobody listens at ``host:port``
+    """
+    host, _, port = (address or "").rpartition(":")
+    if not host or "/" in host or not port.isdecimal():
+        return  # none, "auto", or one of Ray's other forms
+    try:
+        socket.create_connection((host, int(port)), _CONNECT_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise ValueError(f"there is no Ray cluster at {address}: {error}") from None
