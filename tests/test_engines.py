@@ -8,6 +8,7 @@ import signal
 
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3.common.callbacks import EvalCallback
 
 from fed_envs.faults import ClientError
@@ -34,7 +35,7 @@ class Here(Engine):
         self.asked.append(sorted(rounds))
         return {k: self.workers[k].train(round) for k, round in rounds.items()}
 
-    def close(self):
+    def _end(self):
         self.workers = []
 
 
@@ -129,6 +130,43 @@ def test_a_broken_client_is_named_with_its_round():
         model.learn(128)
 
 
+class Interrupted(Here):
+    def _train(self, rounds):
+        raise KeyboardInterrupt
+
+
+def test_after_an_interrupt_no_worker_is_asked_again(small):
+    plain, model = (Local("MlpPolicy", [lambda: CountingEnv(0.3)] * 2, **small) for _ in range(2))
+    engine = Interrupted(2)
+    engine.attach(model)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(128)
+    assert engine.workers == [] and model.engine is None
+    plain.learn(128)
+    model.learn(128, reset_num_timesteps=False)  # here, from where it was before
+    assert_same_training(plain, model)
+
+
+def test_an_engine_trains_one_model_and_a_model_has_one_engine(small):
+    first, second = (Local("MlpPolicy", [lambda: CountingEnv(0.3)], **small) for _ in range(2))
+    engine, other = Here(1), Here(1)
+    engine.attach(first)
+    engine.attach(second)
+    assert first.engine is None and second.engine is engine
+    other.attach(second)
+    assert second.engine is other and engine.workers == []
+
+
+def test_another_device_is_refused(small, capsys):
+    model = Local("MlpPolicy", [lambda: CountingEnv(0.3)], **small)
+    model.device = th.device("meta")
+    with pytest.raises(ValueError, match="engines train on CPUs, and the device is meta"):
+        Here(1).attach(model)
+    with pytest.raises(SystemExit):
+        main([*SMALL_RUN, "--engine", "processes", "--device", "cuda"])
+    assert "--engine processes trains on CPUs" in capsys.readouterr().err
+
+
 def test_callbacks_that_count_steps_are_refused(small):
     model = Local("MlpPolicy", [lambda: CountingEnv(0.3)] * 2, **small)
     Here(2).attach(model)
@@ -152,10 +190,11 @@ def test_a_worker_process_that_is_killed(small):
         engine.attach(model)
         model.learn(64)
         assert_same_training(plain, model)
-        os.kill(engine._processes[0].pid, signal.SIGKILL)
+        processes = list(engine._processes)
+        os.kill(processes[0].pid, signal.SIGKILL)
         with pytest.raises(EngineError, match="go on from the last checkpoint"):
             model.learn(64, reset_num_timesteps=False)
-        processes = list(engine._processes)
+        assert model.engine is None
     assert not any(process.is_alive() for process in processes)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import time
+from pathlib import Path
 
 import pytest
 
@@ -39,6 +41,14 @@ def actor_facts(engine):
     return ray.get([actor.__ray_call__.remote(facts) for actor in engine._actors])
 
 
+def wait_for_end(pid: int) -> None:
+    """An actor outlives its node by a moment."""
+    until = time.monotonic() + 60
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < until:
+        time.sleep(0.1)
+    assert not Path(f"/proc/{pid}").exists()
+
+
 def test_actors_on_two_nodes_and_their_loss(cluster, small):
     from sb3_fedguide.engines.ray_actors import RayActors
 
@@ -61,6 +71,7 @@ def test_actors_on_two_nodes_and_their_loss(cluster, small):
         assert after[0][0] != before[0][0]
         lost = next(node for node in nodes if node.node_id == after[1][1])
         made.remove_node(lost, allow_graceful=False)
+        wait_for_end(after[1][0])
         learn(1)
         assert lost.node_id not in {node for _, node in actor_facts(engine)}
     assert_same_training(plain, model)

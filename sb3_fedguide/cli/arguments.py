@@ -105,6 +105,8 @@ def _problems(arguments: Any) -> list[str]:
         found.append(f"--save-freq must not be negative, not {arguments.save_freq}; 0 writes no checkpoints")
     if arguments.eval_average and arguments.no_eval:
         found.append("--eval-average and --no-eval contradict each other; give one of them")
+    if arguments.engine != "lockstep" and arguments.device not in ("cpu", "auto"):
+        found.append(f"--engine {arguments.engine} trains on CPUs; leave out --device {arguments.device}, or the engine")
     if arguments.ray_address is not None and arguments.engine != "ray":
         found.append("--ray-address is for --engine ray")
     if arguments.picture_freq < 0:

@@ -37,17 +37,22 @@ class Engine(ABC):
     def __init__(self, num_actors: int) -> None:
         self.num_actors = num_actors
         self.groups: list[list[int]] = []
+        self._model: Federation | None = None
 
     def attach(self, model: Federation) -> None:
         """Let the workers train ``model``'s clients from its next round on.
 
         :raises ValueError: where the model or its environments cannot be sent to other processes
         """
+        if model.device.type != "cpu":
+            raise ValueError(f"engines train on CPUs, and the device is {model.device}; use device='cpu', or no engine")
+        for engine in {self, model.engine or self}:
+            engine.close()
         n_groups = min(self.num_actors, model.n_clients)
         # Neighbours are often alike and as slow as each other, so that every n-th client makes groups of equal length.
         self.groups = [list(range(first, model.n_clients, n_groups)) for first in range(n_groups)]
         self._start([describe(model, group) for group in self.groups])
-        model.engine = self
+        model.engine, self._model = self, model
 
     @abstractmethod
     def _start(self, blobs: Sequence[bytes]) -> None:
@@ -61,8 +66,15 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def close(self) -> None:
+    def _end(self) -> None:
         """End all workers."""
+
+    def close(self) -> None:
+        """End all workers; the model's clients then train in this process again."""
+        if self._model is not None and self._model.engine is self:
+            self._model.engine = None
+        self._model = None
+        self._end()
 
     def __enter__(self) -> Engine:
         return self
@@ -84,7 +96,11 @@ class Engine(ABC):
         steps_at_once = model._active_steps(model._federated_env())
         parts = {k: _part(model, state, group) for k, group in enumerate(self.groups)}
         active = [k for k, group in enumerate(self.groups) if model.present[group].any()]
-        trained = self._train({k: Round(parts[k], model._total_timesteps, steps_at_once) for k in active})
+        try:
+            trained = self._train({k: Round(parts[k], model._total_timesteps, steps_at_once) for k in active})
+        except BaseException:
+            self.close()  # a worker that has not been heard would answer the next round with this one's result
+            raise
         for reply in trained.values():
             if isinstance(reply, ClientError):
                 raise reply

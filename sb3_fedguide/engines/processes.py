@@ -46,7 +46,7 @@ class Processes(Engine):
         for pipe in self._pipes:
             problem = _received(pipe, "while it started")
             if problem is not None:
-                self.close()
+                self._end()
                 raise ValueError(f"this federation cannot be made in another process: {problem}")
 
     def _train(self, rounds: dict[int, Round]) -> dict[int, Trained | ClientError]:
@@ -57,7 +57,7 @@ class Processes(Engine):
                 raise EngineError(f"a worker process is gone: {error}") from error
         return {k: _received(self._pipes[k], "in the round") for k in rounds}
 
-    def close(self) -> None:
+    def _end(self) -> None:
         for pipe in self._pipes:
             pipe.close()  # the process sees the end of the pipe
         for process in self._processes:

@@ -46,17 +46,24 @@ class RayActors(Engine):
         if not ray.is_initialized():
             _check_address(self.address)
             resources = {"num_cpus": max(self.num_actors, os.cpu_count() or 1)} if self.address is None else {}
-            ray.init(self.address, include_dashboard=False, log_to_driver=False, logging_level="warning", **resources)
+            ray.init(
+                self.address or "local", include_dashboard=False, log_to_driver=False, logging_level="warning", **resources
+            )
             self._started_ray = True
         n_cpus = int(ray.cluster_resources().get("CPU", 0))
         if n_cpus < len(blobs):
-            self.close()
+            self._end()
             raise ValueError(f"the Ray cluster has {n_cpus} CPUs and each of {len(blobs)} actors takes one; use fewer actors")
         environment = {"env_vars": {"OMP_NUM_THREADS": "1"}}
         actor = ray.remote(Worker).options(
             num_cpus=1, max_restarts=-1, max_task_retries=0, scheduling_strategy="SPREAD", runtime_env=environment
         )
         self._actors = [actor.remote(blob) for blob in blobs]
+        try:
+            ray.get([actor.ready.remote() for actor in self._actors])
+        except ray.exceptions.ActorDiedError as error:
+            self._end()
+            raise ValueError(f"this federation cannot be made in a Ray actor: {error}") from error
 
     def _train(self, rounds: dict[int, Round]) -> dict[int, Trained | ClientError]:
         waiting = {k: self._actors[k].train.remote(round) for k, round in rounds.items()}
@@ -71,7 +78,11 @@ class RayActors(Engine):
                 return ray.get(reply)
             except ray.exceptions.RayTaskError as error:
                 raise error.as_instanceof_cause() from None
-            except (ray.exceptions.ActorUnavailableError, ray.exceptions.ActorDiedError) as error:
+            except (
+                ray.exceptions.ActorUnavailableError,
+                ray.exceptions.ActorDiedError,
+                ray.exceptions.ObjectLostError,  # its reply went with its node
+            ) as error:
                 now = time.monotonic()
                 lost_since = now if lost_since is None else lost_since
                 if now - lost_since > RESTART_SECONDS:
@@ -79,7 +90,7 @@ class RayActors(Engine):
                 time.sleep(1.0)
                 reply = self._actors[k].train.remote(round)
 
-    def close(self) -> None:
+    def _end(self) -> None:
         for actor in self._actors:
             self._ray.kill(actor)
         self._actors = []

@@ -64,6 +64,10 @@ class Worker:
         self.model.strategy = None
         self.callbacks = CallbackList([])
 
+    def ready(self) -> bool:
+        """Answers as soon as the worker is made."""
+        return True
+
     def train(self, round: Round) -> Trained | ClientError:
         """One round of its clients; a fault of a client is returned, not raised."""
         model = self.model
