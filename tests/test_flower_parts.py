@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import http.client
 import http.server
 import json
@@ -13,7 +14,8 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import ClassVar
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ import yaml
 
 from sb3_fedguide.cli.main import main as fedguide
 from sb3_fedguide.server.transport import Failure, Message
+from tests.flower_deployment import SMALL
 
 pytestmark = pytest.mark.flower
 
@@ -176,6 +179,40 @@ def test_a_new_server_certificate_keeps_the_authority(tmp_path: Path) -> None:
     assert context.get_ca_certs()
 
 
+def test_an_authority_outlives_what_it_signs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At the end of a server's certificate the authority lives as long again, and where it does not, that is said."""
+    from cryptography import x509
+
+    from sb3_fedguide.flower import certificates
+
+    def days_left(path: Path) -> int:
+        ends = x509.load_pem_x509_certificate(path.read_bytes()).not_valid_after_utc
+        return round((ends - datetime.datetime.now(datetime.UTC)) / datetime.timedelta(days=1))
+
+    def command(folder: Path, *flags: str) -> int:
+        return fedguide(["deploy", "certificates", str(folder), "--host", "localhost", *flags])
+
+    long, short = tmp_path / "long", tmp_path / "short"
+    assert command(long) == 0
+    assert (days_left(long / "ca.crt"), days_left(long / "server.crt")) == (3650, 825)
+    monkeypatch.setattr(certificates, "_AUTHORITY_DAYS", 30)
+    assert command(short, "--days", "10") == 0
+    before = {path.name: path.read_bytes() for path in short.iterdir()}
+    capsys.readouterr()
+    assert command(short) == 2
+    error = capsys.readouterr().err
+    assert (
+        "give at most 29 days, or remove ca.crt and ca.key to begin with a new authority" in error and error.count("\n") == 1
+    )
+    assert {path.name: path.read_bytes() for path in short.iterdir()} == before
+    assert command(short, "--days", "29") == 0 and days_left(short / "server.crt") == 29
+    monkeypatch.setattr(certificates, "_AUTHORITY_DAYS", 0)
+    assert command(tmp_path / "ended") == 2
+    assert "a server certificate of 825 days would outlive; remove ca.crt" in capsys.readouterr().err
+
+
 def test_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from sb3_fedguide.flower.certificates import read_public_key
 
@@ -281,6 +318,121 @@ def test_the_server_takes_what_concerns_it_from_the_clients_settings(keys: Path)
     assert (server.n_rounds, server.rollout_size, server.settings) == (7, 200, {"eta": 0.2})
     for cls in (FederatedPPO, FederatedDDPG):
         assert hyperparameters(cls)["rollout_size"][1] == ROLLOUT_SIZE
+
+
+def test_settings_are_where_the_file_says_whatever_the_working_directory_is(
+    keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sb3_fedguide.cli.deploy_config import ClientDeployment, ServerDeployment
+
+    (keys / "own.yml").write_text(yaml.safe_dump({"default": {"n_rounds": 7}}))
+    monkeypatch.chdir(tmp_path)
+    server, client = keys / "server_own.yml", keys / "client_own.yml"
+    server.write_text(yaml.safe_dump({**SERVER, "conf": "own.yml"}))
+    client.write_text(yaml.safe_dump({**CLIENT, "conf": "own.yml"}))
+    assert ServerDeployment(server).server.n_rounds == 7
+    assert ClientDeployment(client).site["conf"] == str(keys / "own.yml")
+    client.write_text(yaml.safe_dump({**CLIENT, "conf": "paper"}))
+    assert ClientDeployment(client).site["conf"] == "paper"
+
+
+class Grid:
+    """Stands for Flower's: both clients are online, and answer at once."""
+
+    def __init__(self, *pushed: list[str | None]) -> None:
+        self.pushed, self.limits = list(pushed), []
+
+    def get_nodes(self) -> list[Any]:
+        return [SimpleNamespace(public_key=key, node_id=number) for number, key in enumerate((b"a", b"b"))]
+
+    def push_messages(self, messages: list[Any]) -> list[str | None]:
+        self.limits += [message.metadata.ttl for message in messages]
+        return self.pushed.pop(0)
+
+    def pull_messages(self, numbers: list[str]) -> list[Any]:
+        from sb3_fedguide.flower.records import to_records
+
+        assert all(numbers)
+        content = to_records(Message("round", 1))
+        return [
+            SimpleNamespace(metadata=SimpleNamespace(reply_to_message_id=number), content=content, has_error=lambda: False)
+            for number in numbers
+        ]
+
+
+@pytest.fixture
+def task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in the process of a round loop: Flower's messages say which it is."""
+    from flwr.supercore.task_identity import TaskIdentity
+
+    for name in ("_task_id", "_run_id", "_node_id"):
+        monkeypatch.setattr(TaskIdentity, name, 1)
+
+
+@pytest.mark.usefixtures("task")
+@pytest.mark.parametrize("refused", [[], [None], [""]], ids=["too large", "refused", "not stored"])
+def test_a_request_that_flower_does_not_take_is_a_failure(refused: list[str | None]) -> None:
+    """Flower has no exception for it, and the others' answers count."""
+    from sb3_fedguide.flower.transport import FlowerTransport
+
+    requests = {client: Message("round", 1) for client in (0, 1, 2)}
+    replies = FlowerTransport(Grid(refused, ["1"]), {b"a": 0, b"b": 1, b"c": 2}).exchange(requests, 60.0)  # type: ignore[arg-type]
+    assert replies == {0: Failure("gone"), 1: Message("round", 1), 2: Failure("gone")}
+
+
+@pytest.mark.usefixtures("task")
+@pytest.mark.parametrize(("timeout", "limit"), [(60.0, 60.0), (None, 10 * 365 * 86400.0), (1e12, 10 * 365 * 86400.0)])
+def test_no_timeout_is_none(timeout: float | None, limit: float) -> None:
+    """Flower would forget a message without a limit after twelve hours, and refuses one that ends after the year 9999."""
+    from sb3_fedguide.flower.transport import FlowerTransport
+
+    grid = Grid(["1"])
+    assert FlowerTransport(grid, {b"a": 0}).exchange({0: Message("round", 1)}, timeout) == {0: Message("round", 1)}  # type: ignore[arg-type]
+    assert grid.limits == [limit]
+
+
+def test_a_client_that_has_finished_ends_at_once(
+    keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As after a reboot: it waits for no server. With other settings it is refused; what has not finished is started."""
+    from sb3_fedguide.common.site import make_site
+    from sb3_fedguide.flower import client_node
+
+    class StartedError(Exception):
+        pass
+
+    def start(*_: object) -> None:
+        raise StartedError
+
+    monkeypatch.setattr(client_node, "FlowerProcess", start)
+    folder, path = tmp_path / "out", keys / "finished.yml"
+    own = {"algo": "fedavg", "env": "Bandit2D", "client": 0, "params": SMALL, "eval_freq": 0, "cache_dir": str(tmp_path)}
+
+    def command(seed: int = 0) -> int:
+        connection = {"server": "localhost:1", "ca": "certificates/ca.crt", "key": "a", "folder": str(folder)}
+        path.write_text(yaml.safe_dump({**own, "seed": seed, **connection}))
+        return fedguide(["deploy", "client", str(path)])
+
+    site = make_site({**own, "seed": 0}, folder / "site")
+    for message in (
+        Message("setup", 0, facts={"run": "r"}),
+        Message("finish", 1, facts={"run": "r", "broadcast": 0, "after": 0}),
+    ):
+        site.handle(message)
+    with pytest.raises(StartedError):  # parameters are there, and the server has not had the answer
+        command()
+    assert "localhost:1 does not answer yet" in capsys.readouterr().out
+    (folder / "finished").touch()
+    assert command() == 0
+    said = capsys.readouterr()
+    assert "the federation has had its last round; a new one needs a folder other than" in said.out
+    assert "does not answer" not in said.out
+    assert command(seed=1) == 2
+    assert "is of another run: its seed is 0, here 1" in capsys.readouterr().err
+    (folder / "site" / "parameters.npz").unlink()
+    with pytest.raises(StartedError):
+        command()
+    assert not (folder / "finished").exists()
 
 
 def test_messages_survive_flower(certificates: Path) -> None:

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.benchmark_arguments import PASSED_ON, SETTINGS, check_methods, parse_benchmark, train_flags
-from sb3_fedguide.cli.run import EXIT_USAGE, one_message
+from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, one_message
 from sb3_fedguide.cli.train import (
-    EXIT_FAILED,
     EXIT_INTERRUPTED,
     check_before_imports,
     find_family,

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_fedguide.cli.arguments import OneLineParser
+from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.cli.run_folder import exclusive, write_json
 from sb3_fedguide.cli.signals import StopSignals
 
 if TYPE_CHECKING:
     from sb3_fedguide.cli.deploy_config import ClientDeployment
 
-EXIT_FAILED, EXIT_USAGE = 1, 2
 #: In a deployment's folder, what its processes are told.
 CONFIG = "config.json"
 
@@ -117,17 +117,18 @@ def _client(arguments: argparse.Namespace) -> int:
 
     deployment = ClientDeployment(arguments.config)
     read_site_config(deployment.site)
-    _check_server(deployment)
     config = _prepare(deployment.folder)
+    node = ClientNode(deployment.server, deployment.ca, deployment.key, config, deployment.folder)
+    if not node.finished:
+        _check_server(deployment)
     with exclusive(deployment.folder):
         # What is wrong with it is said now; in another process, since forks cannot use a GPU that this one has used.
         with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as processes:
             processes.submit(_try_site, deployment).result()
         write_json(config, deployment.told())
-        node = ClientNode(deployment.server, deployment.ca, deployment.key, config, deployment.folder)
         print(f"client {deployment.site.get('client')} of {deployment.server}, writing to {deployment.folder}", flush=True)
         node.run()
-        print("the federation has had its last round", flush=True)
+        print(f"the federation has had its last round; a new one needs a folder other than {deployment.folder}", flush=True)
     return 0
 
 

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import pydantic
 
 from sb3_fedguide.algorithms import ALGORITHMS
-from sb3_fedguide.cli.config import DEFAULT, config_path, read_config, read_yaml
+from sb3_fedguide.cli.config import CONFIGURATIONS, DEFAULT, config_path, read_config, read_yaml
 from sb3_fedguide.cli.names import check_names
 from sb3_fedguide.flower.certificates import CA, SERVER, SERVER_KEY, read_public_key
 from sb3_fedguide.server.build import COMMON, find_method, make_strategy
@@ -100,7 +100,7 @@ class ServerDeployment:
             raise ValueError(f"{path}: clients are numbered from 0 to {len(self.clients) - 1}, not {sorted(self.clients)}")
         if len(self.keys) < len(self.clients):
             raise ValueError(f"{path}: two clients have the same key; every client has a key of its own")
-        settings = _settings(file)
+        settings = _settings(file, base)
         given = {name: settings[name] for name in (*COMMON, *find_method(file.algo).defaults) if name in settings}
         limits = {name: getattr(file, name) for name in ("timeout", "setup_timeout", "start_clients", "min_clients", "wait")}
         rollout_size = settings.get("rollout_size", ROLLOUT_SIZE)
@@ -139,6 +139,8 @@ class ClientDeployment:
         for name in ("metadata", "cache_dir"):
             if isinstance(given.get(name), str):
                 given[name] = str(base / given[name])
+        if isinstance(given.get("conf"), str):
+            given["conf"] = _conf(given["conf"], base)
         self.site = given
 
     def told(self) -> dict[str, Any]:
@@ -146,10 +148,15 @@ class ClientDeployment:
         return {"site": self.site, "folder": str(self.folder)}
 
 
-def _settings(file: ServerFile) -> dict[str, Any]:
+def _conf(conf: str, base: Path) -> str:
+    """A configuration's name as it is, a path as seen from the file that gives it."""
+    return conf if conf in CONFIGURATIONS else str(base / conf)
+
+
+def _settings(file: ServerFile, base: Path) -> dict[str, Any]:
     """What the clients' settings are made of, as far as it is not nested."""
     check_names([file.algo], ALGORITHMS, "algorithm")
-    content = read_config(config_path(file.conf, file.algo))
+    content = read_config(config_path(_conf(file.conf, base), file.algo))
     return {**content.get(DEFAULT, {}), **content.get(file.env, {}), **file.params}
 
 

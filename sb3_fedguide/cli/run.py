@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
-EXIT_USAGE = 2
+EXIT_FAILED, EXIT_USAGE = 1, 2
 LONGEST_MESSAGE = 2000
 
 

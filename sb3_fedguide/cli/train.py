@@ -20,7 +20,7 @@ from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.names import check_names
 from sb3_fedguide.cli.resume import finished_rounds, given_flags, load_checkpoint, read_arguments, read_settings
-from sb3_fedguide.cli.run import EXIT_USAGE, Run, one_message
+from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, Run, one_message
 
 if TYPE_CHECKING:
     from fed_envs import Family
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
-EXIT_FAILED = 1
 EXIT_INTERRUPTED = 130
 PACKAGE = Path(__file__).parents[1]
 ID_PREFIX, ID_SUFFIX = "fed_envs/", "-v0"

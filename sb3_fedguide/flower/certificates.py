@@ -19,6 +19,9 @@ SERVER, SERVER_KEY = "server.crt", "server.key"
 #: Where Flower's SuperLink listens, so that the server's certificate has to hold for it too.
 LOOPBACK = "127.0.0.1"
 
+#: How long an authority holds: several server certificates, since clients get another ``ca.crt`` by hand only.
+_AUTHORITY_DAYS = 3650
+
 
 def write_certificates(folder: Path, hosts: Sequence[str], days: int = 825) -> None:
     """Write ``server.crt`` and ``server.key``, signed by the authority in ``folder``, which is made where there is none.
@@ -26,8 +29,8 @@ def write_certificates(folder: Path, hosts: Sequence[str], days: int = 825) -> N
     Of the four files, clients get ``ca.crt`` and nothing else. ``ca.key`` is needed again for the next server certificate.
 
     :param hosts: names and addresses under which clients reach the server
-    :param days: how long the certificates hold
-    :raises ValueError: for a name that is none, or where the files cannot be written
+    :param days: how long the server's certificate holds
+    :raises ValueError: for a name that is none, where the files cannot be written, or where the authority ends earlier
     """
     names = [_general_name(host) for host in dict.fromkeys([*hosts, "localhost", LOOPBACK])]
     try:
@@ -35,8 +38,9 @@ def write_certificates(folder: Path, hosts: Sequence[str], days: int = 825) -> N
         if not (folder / CA).exists() and not (folder / CA_KEY).exists():
             key = ec.generate_private_key(ec.SECP384R1())
             subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "federation's certificate authority")])
-            authority = _sign(subject, subject, key, key, days, [(x509.BasicConstraints(ca=True, path_length=0), True),
-                              (_key_usage(signs_certificates=True), True)])  # fmt: skip
+            authority = _sign(subject, subject, key, key, _AUTHORITY_DAYS, [
+                (x509.BasicConstraints(ca=True, path_length=0), True), (_key_usage(signs_certificates=True), True),
+            ])  # fmt: skip
             _write_private(folder / CA_KEY, _pem(key))
             (folder / CA).write_bytes(authority.public_bytes(serialization.Encoding.PEM))
         authority = x509.load_pem_x509_certificate((folder / CA).read_bytes())
@@ -45,6 +49,13 @@ def write_certificates(folder: Path, hosts: Sequence[str], days: int = 825) -> N
         raise ValueError(f"{error.filename}: {error.strerror}") from None
     if not isinstance(authority_key, ec.EllipticCurvePrivateKey) or authority_key.public_key() != authority.public_key():
         raise ValueError(f"{folder / CA_KEY} is not the key of {folder / CA}; remove both to begin with a new authority")
+    ends = authority.not_valid_after_utc
+    if days > (left := (ends - datetime.datetime.now(datetime.UTC)).days):
+        raise ValueError(
+            f"{folder / CA} holds until {ends:%Y-%m-%d} only, which a server certificate of {days} days would outlive; "
+            f"{f'give at most {left} days, or ' if left > 0 else ''}remove {CA} and {CA_KEY} to begin with a new authority, "
+            f"and replace {CA} on every client"
+        )
     key = ec.generate_private_key(ec.SECP384R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, str(hosts[0])[:64])])
     extensions: list[tuple[x509.ExtensionType, bool]] = [

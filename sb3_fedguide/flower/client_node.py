@@ -14,7 +14,9 @@ from flwr.proto.runtime_pb2 import AcquireTaskRequest
 from flwr.supercore.constant import TaskType
 from flwr.supercore.runtime import RuntimeHttpClient
 
-from sb3_fedguide.flower.client_app import FINISHED, app
+from sb3_fedguide.common.site import PARAMETERS
+from sb3_fedguide.flower.certificates import LOOPBACK
+from sb3_fedguide.flower.client_app import FINISHED, SITE, app
 from sb3_fedguide.flower.processes import FlowerProcess, environment, free_port, runtime_version
 
 _POLL_SECONDS = 0.2
@@ -24,7 +26,6 @@ _RESTART_SECONDS = 10.0
 _EXIT_SECONDS = 5.0
 #: In which the SuperNode delivers the last reply.
 _LAST_SECONDS = 5.0
-_HOST = "127.0.0.1"
 
 
 class ClientNode:
@@ -45,28 +46,28 @@ class ClientNode:
         self._folder = folder
         self._arguments = [
             "--superlink", server, "--root-certificates", str(ca), "--auth-supernode-private-key", str(key),
-            "--node-config", f"config='{config}'", "--isolation", "process", "--host", _HOST,
+            "--node-config", f"config='{config}'", "--isolation", "process", "--host", LOOPBACK,
         ]  # fmt: skip
         self._env = environment(folder)
 
     @property
     def finished(self) -> bool:
-        """Whether the federation has come to its end since :meth:`run` began."""
+        """Whether the federation has come to its end."""
         return (self._folder / FINISHED).exists()
 
     def run(self) -> None:
-        """Run until the federation has come to its end."""
-        (self._folder / FINISHED).unlink(missing_ok=True)
-        while True:
+        """Run until the federation has come to its end; where it has already, there is nothing to run for."""
+        if not (self._folder / SITE / PARAMETERS).exists():  # it was not prepared when the end came
+            (self._folder / FINISHED).unlink(missing_ok=True)
+        while not self.finished:
             port = free_port()
             arguments = [*self._arguments, "--port", str(port)]
             with FlowerProcess("flwr.supernode.cli", "flower_supernode", arguments, self._env) as node:
-                self._answer(node, f"{_HOST}:{port}")
+                self._answer(node, f"{LOOPBACK}:{port}")
                 code = node.exit_code
-            if self.finished:
-                return
-            print(f"the SuperNode has stopped ({code}); starting it again in {_RESTART_SECONDS:.0f} s", file=sys.stderr)
-            time.sleep(_RESTART_SECONDS)
+            if not self.finished:
+                print(f"the SuperNode has stopped ({code}); starting it again in {_RESTART_SECONDS:.0f} s", file=sys.stderr)
+                time.sleep(_RESTART_SECONDS)
 
     def _answer(self, node: FlowerProcess, address: str) -> None:
         """Answer messages until the SuperNode ends, or the federation."""

@@ -15,6 +15,8 @@ from types import TracebackType
 
 from flwr.supercore.interceptors import RuntimeVersionHttpInterceptor
 
+from sb3_fedguide.flower.certificates import LOOPBACK
+
 #: The deployment uses what is no public interface of Flower, and is tested with these releases only.
 FLOWER = "1.41."
 _GRACE_SECONDS = 10.0
@@ -47,7 +49,7 @@ def runtime_version(component: str) -> RuntimeVersionHttpInterceptor:
 
 def free_port() -> int:
     """A port of the loopback device that nobody listens on now."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
+    with socket.create_server((LOOPBACK, 0)) as server:
         return server.getsockname()[1]
 
 

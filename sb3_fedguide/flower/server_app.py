@@ -13,6 +13,7 @@ from flwr.app import Context
 from flwr.serverapp import Grid, ServerApp
 from tensorboard.summary import Writer
 
+from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.flower.certificates import read_public_key
 from sb3_fedguide.flower.transport import FlowerTransport
 from sb3_fedguide.server.config import ServerConfig
@@ -20,8 +21,6 @@ from sb3_fedguide.server.serve import TooFewClients, serve
 
 #: Environment variable with the path of what the server is told. Flower's own run configuration would go to the clients.
 CONFIG = "FEDGUIDE_SERVER_CONFIG"
-#: Exit code where trying again is of no use.
-EXIT_USAGE = 2
 
 logger = logging.getLogger(__name__)
 app = ServerApp()
@@ -43,7 +42,7 @@ def main(grid: Grid, context: Context) -> None:
         serve(ServerConfig(**told["server"]), FlowerTransport(grid, clients), told["folder"], log)
     except TooFewClients as error:
         logger.error("%s; the next start goes on from the last checkpoint", error)
-        sys.exit(1)
+        sys.exit(EXIT_FAILED)
     except ValueError as error:
         logger.error("%s", error)
         sys.exit(EXIT_USAGE)

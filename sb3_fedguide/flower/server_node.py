@@ -19,6 +19,7 @@ from flwr.supercore.fab import Fab
 from flwr.supercore.runtime import RuntimeHttpClient
 
 from sb3_fedguide import __version__
+from sb3_fedguide.cli.run import EXIT_FAILED
 from sb3_fedguide.flower.certificates import CA, LOOPBACK, SERVER, SERVER_KEY
 from sb3_fedguide.flower.processes import FlowerProcess, environment, free_port, runtime_version
 from sb3_fedguide.flower.proxy import FleetProxy, ProxyServer
@@ -26,7 +27,6 @@ from sb3_fedguide.flower.server_app import CONFIG
 
 _POLL_SECONDS = 0.2
 _START_SECONDS = 120.0
-EXIT_FAILED = 1
 
 #: The app that Flower hands to the clients: a name, a version and no code.
 _APP = f"""

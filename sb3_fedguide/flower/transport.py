@@ -14,6 +14,8 @@ from sb3_fedguide.flower.records import from_records, to_records
 from sb3_fedguide.server.transport import Failure, Message
 
 _POLL_SECONDS = 0.2
+#: Flower takes a message without a limit for one of twelve hours.
+_NO_LIMIT = 10 * 365 * 86400.0
 _REASONS = {
     ErrorCode.MESSAGE_UNAVAILABLE: "timeout",
     ErrorCode.REPLY_MESSAGE_UNAVAILABLE: "timeout",
@@ -37,10 +39,12 @@ class FlowerTransport:
         return sorted(self._nodes())
 
     def exchange(self, requests: Mapping[int, Message], timeout: float | None) -> dict[int, Message | Failure]:
-        until = float("inf") if timeout is None else time.monotonic() + timeout
+        limit = _NO_LIMIT if timeout is None else min(timeout, _NO_LIMIT)
+        until = time.monotonic() + limit
         nodes = self._nodes()
-        replies: dict[int, Message | Failure] = {client: Failure("gone") for client in requests if client not in nodes}
-        waiting = {self._send(nodes[client], requests[client], timeout): client for client in requests if client in nodes}
+        sent = {client: self._send(nodes[client], requests[client], limit) for client in requests if client in nodes}
+        waiting = {message: client for client, message in sent.items() if message}
+        replies: dict[int, Message | Failure] = {client: Failure("gone") for client in requests if not sent.get(client)}
         while waiting and time.monotonic() < until:
             for reply in self._grid.pull_messages(list(waiting)):
                 # Error replies come from the SuperLink: who is meant, only the id of the request says.
@@ -50,12 +54,12 @@ class FlowerTransport:
                 time.sleep(_POLL_SECONDS)
         return {client: replies.get(client, Failure("timeout")) for client in requests}
 
-    def _send(self, node: int, request: Message, timeout: float | None) -> str:
-        """Hand a request to the SuperLink, which forgets it after the timeout; return its id."""
+    def _send(self, node: int, request: Message, timeout: float) -> str | None:
+        """Hand a request to the SuperLink, which forgets it after the timeout; return its id, or nothing if it is refused."""
         message = FlowerMessage(
             to_records(request), node, MessageType.TRAIN, ttl=timeout, group_id=f"{request.kind} {request.round}"
         )
-        return next(iter(self._grid.push_messages([message])))
+        return next(iter(self._grid.push_messages([message])), None)
 
     def _nodes(self) -> dict[int, int]:
         """Flower's number of each client that is online."""
