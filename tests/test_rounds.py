@@ -30,7 +30,7 @@ from sb3_fedguide.server.rounds import Rounds, participants
 from sb3_fedguide.server.serve import Server, ServerConfig, TooFewClients, serve
 from sb3_fedguide.server.svrpg import SVRPG
 from sb3_fedguide.server.transport import Failure, Message
-from sb3_fedguide.server.trunk import TrunkAverages, moments_fault
+from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_fault
 from tests.loop_transport import LoopTransport, timeout
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -46,14 +46,14 @@ class Client:
         self.trained: list[int] = []
 
     def handle(self, message: Message) -> Message:
+        if message.kind == "join":
+            return Message("join", message.round, facts=self.facts)
         if (message.kind, message.round) != (self.reply.kind, self.reply.round):
             payload, facts = self.answer(message)
             self.reply = Message(message.kind, message.round, payload, facts)
         return self.reply
 
     def answer(self, message: Message) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        if message.kind == "join":
-            return {}, self.facts
         if message.kind == "setup":
             return {}, {}
         if message.payload and message.facts["broadcast"] > self.n_received:
@@ -430,6 +430,79 @@ def test_a_server_that_is_killed_goes_on_to_the_same_end(kind, round, before, tm
     assert rows == [] and transport.site(0).trained == [1, 2, 3, 4, 5]
 
 
+def evaluates(client: int) -> Client:
+    """Measures what was sent last."""
+
+    class Evaluating(Client):
+        def answer(self, message: Message):
+            payload, facts = super().answer(message)
+            if message.kind == "finish":
+                facts = {"evaluations": [ClientEvaluation(client, 5, "broadcast", [float(client)], [7]).facts()]}
+            return payload, facts
+
+    return Evaluating(client)
+
+
+def test_what_is_measured_at_the_end_has_the_steps_of_the_last_round():
+    _, _, rows = run(transport=LoopTransport(evaluates, [0, 1, 2, 3]))
+    assert rows[-1] == {"round": 5, "eval/broadcast_mean_reward": 1.5, "time/total_timesteps": 160} and len(rows) == 6
+
+
+def test_who_is_away_at_the_end_hears_of_it_when_it_comes_back(tmp_path):
+    transport = LoopTransport(evaluates, [0, 1, 2, 3])
+    transport.undelivered = {(2, "finish", 5)}
+    patient = replaced(CONFIG, wait=None, timeout=30.0)
+    _, server, rows = run(patient, transport, tmp_path / "waits")
+    assert [key for key in transport.sent if key[1] == "finish"] == [
+        *((client, "finish", 5) for client in range(4)),
+        (2, "finish", 5),
+    ]
+    assert sorted(server.told) == [0, 1, 2, 3] and server.outbox == {}
+    np.testing.assert_array_equal(transport.site(2).theta, expected())
+    assert [row["round"] for row in rows] == [1, 2, 3, 4, 5, 5]  # of those who come late there is no average
+    assert len((tmp_path / "waits" / "evaluations.csv").read_text().splitlines()) == 1 + 5 * 4 + 4
+
+
+def test_a_finished_server_that_is_started_again_tells_who_was_away(tmp_path, caplog):
+    transport = LoopTransport(evaluates, [0, 1, 2, 3])
+    transport.undelivered = {(2, "finish", 5)}
+    with caplog.at_level(logging.WARNING):
+        _, server, _ = run(transport=transport, folder=tmp_path)
+    assert server.finished and server.told == [0, 1, 3] and list(server.outbox) == [2]
+    assert "clients [2] have not heard that the run is over" in caplog.text
+    nobody = LoopTransport(Client, [])
+    run(transport=nobody, folder=tmp_path)
+    assert nobody.sent == []
+    transport.sent.clear()
+    _, server, rows = run(transport=transport, folder=tmp_path)
+    assert [key for key in transport.sent if key[1] != "join"] == [(2, "finish", 5)] and rows == []
+    np.testing.assert_array_equal(transport.site(2).theta, expected())
+    transport.sent.clear()
+    run(replaced(CONFIG, wait=None), transport, tmp_path)
+    assert transport.sent == []
+
+
+def test_another_version_goes_on_with_a_run_if_all_have_it(tmp_path, monkeypatch, caplog):
+    transport = LoopTransport(Client, [0, 1, 2, 3])
+
+    def kill(client: int, message: Message) -> None:
+        if (client, message.kind, message.round) == (0, "round", 3):
+            raise Killed
+
+    transport.watch = kill
+    with pytest.raises(Killed):
+        run(transport=transport, folder=tmp_path)
+    transport.watch = lambda client, message: None
+    monkeypatch.setattr(sb3_fedguide, "__version__", "99.0")
+    for client in (0, 1, 2):
+        transport.site(client).facts["version"] = "99.0"
+    with caplog.at_level(logging.WARNING):
+        _, server, _ = run(transport=transport, folder=tmp_path)
+    assert transport.site(0).trained == [1, 2, 3, 4, 5] and transport.site(3).trained == [1, 2]
+    assert server.round == 5 and list(server.clients.refused) == [3]
+    assert f"client 3 is refused: its version is '{STATED['version']}', the server's '99.0'" in caplog.text
+
+
 def test_the_checkpoint_of_another_federation_is_refused(tmp_path):
     run(folder=tmp_path)
     with pytest.raises(ValueError, match=r"another federation: its seed is 1, this server's 2; give this one a folder"):
@@ -444,6 +517,12 @@ def test_the_checkpoint_of_another_federation_is_refused(tmp_path):
         ({"min_clients": 5}, "min_clients=5, but only 4"),
         ({"min_clients": 3, "settings": {"client_fraction": 0.5}}, "min_clients=3, but only 2"),
         ({"settings": {"lambda_prior": 1.0}}, "no setting 'lambda_prior'"),
+        ({"seed": -1}, "seed=-1 must be an integer"),
+        ({"seed": 1.0}, r"seed=1\.0 must be an integer"),
+        ({"timeout": 0.0}, r"timeout=0\.0 must be a number of seconds above 0, or None"),
+        ({"setup_timeout": float("inf")}, "setup_timeout=inf must be .* or None"),
+        ({"wait": float("nan")}, "wait=nan must be .* or None"),
+        ({"poll": -1.0}, r"poll=-1\.0 must be"),
     ],
 )
 def test_a_configuration_that_cannot_be_is_refused(changes, message):
@@ -464,11 +543,14 @@ def test_reports_are_data_of_strangers():
     assert merge_figures(
         {0: {"figures": "none"}, 1: {}, 2: {"figures": {1: 2, "a": "b", "c": True, "d": 3, "eval/x": 1}}}
     ) == {"d": 3}
+    hostile = {"a": 10**400, "b": float("nan"), "c": float("-inf"), "client_1/d": 10**400, "client_1/e": float("nan"), "f": 2}
+    assert merge_figures({0: {"figures": {"a": 1, "b": 2.0}}, 1: {"figures": hostile}}) == {"a": 1.0, "b": 2.0, "f": 2.0}
     good = ClientEvaluation(4, 2, "broadcast", [1.0, 2.0], [3, 4], [True, False])
     assert read_evaluations(4, {"evaluations": [good.facts()]}) == [good]
     for change in (
         {"returns": [float("nan"), 1.0]}, {"returns": []}, {"lengths": [1]}, {"policy": "../x"}, {"round": "x"},
-        {"successes": [True]}, {"returns": None},
+        {"successes": [True]}, {"returns": None}, {"returns": [10**400, 1.0]}, {"lengths": [10**400, 1]},
+        {"lengths": [2**53, 1]}, {"lengths": [-1, 1]},
     ):  # fmt: skip
         assert read_evaluations(4, {"evaluations": [{**good.facts(), **change}]}) == []
     assert read_evaluations(4, {"evaluations": "x"}) == read_evaluations(4, {"evaluations": [3, None]}) == []
@@ -489,11 +571,31 @@ def moments(**changes: Any) -> dict[str, Any]:
         {"n_samples": np.array(0.0)}, {"n_samples": np.array(1.5)}, {"n_samples": np.array(np.inf)}, {"n_samples": 5.0},
         {"mean": np.zeros(2, np.float32)}, {"mean": np.array([np.nan, 0])}, {"var": -np.ones(2)}, {"var": np.ones(3)},
         {"mean": np.zeros((2, 1)), "var": np.ones((2, 1))}, {"more": np.zeros(1)}, {"mean": "x"},
+        {"mean": np.array([0, -2e12])}, {"var": np.array([2e12, 0])}, {"n_samples": np.array(2.0**41)},
     ],
 )  # fmt: skip
 def test_moments_that_cannot_be_are_found(changes):
     assert moments_fault(moments()) is None
     assert moments_fault(moments(**changes)) is not None
+
+
+@pytest.mark.parametrize("n_updates", [701, 10**9, 10**400, True, "7"])
+def test_one_client_does_not_have_all_train_for_ever(n_updates, caplog):
+    common = {"shapes": {NAME: [3], "observations": [2]}, "trunk": {"prior_average_every": 4}}
+
+    class Trunk(Client):
+        def answer(self, message: Message):
+            if message.kind == "moments":
+                return moments(), {"n_updates": n_updates if self.client == 0 else 7}
+            if message.kind == "trunk":
+                return {"w": np.ones(2, np.float32)}, {}
+            return super().answer(message)
+
+    with caplog.at_level(logging.WARNING):
+        _, server, _ = run(transport=LoopTransport(lambda client: Trunk(client, **common), [0, 1, 2, 3]))
+    assert server.trunk.clients == [1, 2, 3] and server.trunk.n_updates == 7 and server.round == 5
+    assert re.search(r"moments of client 0: it wants \d+ updates|client 0 is left out \(its answer is of no use", caplog.text)
+    assert excessive_updates({0: 700, 1: 7, 2: 7}) == {} and list(excessive_updates({0: 701, 1: 7, 2: 7})) == [0]
 
 
 def test_trunks_are_averaged_by_samples_and_broken_ones_are_left_out():

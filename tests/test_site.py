@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 
 import fed_envs
+import sb3_fedguide
 from fed_envs.metadata import Family, parse_family
 from sb3_fedguide import FedAvg, FederatedEvalCallback
 from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.common.site import PARAMETERS, Site, make_site
-from sb3_fedguide.server.serve import ServerConfig, serve
+from sb3_fedguide.server.serve import ServerConfig, TooFewClients, serve
 from sb3_fedguide.server.transport import RUN, Message
 from tests.conftest import assert_same_parameters
 from tests.loop_transport import LoopTransport, timeout
@@ -236,6 +237,47 @@ def test_what_came_already_is_not_taken_again(tmp_path):
     assert any(array.any() for name, array in first.payload.items() if name != "n_samples")
     kept.handle(dataclasses.replace(request("finish", 4, broadcast=2), payload=average))
     assert not any(tensor.any() for tensor in kept.model.policy.client_state_dict(0).values())
+
+
+def test_a_server_that_has_gone_back_is_refused_before_anything_is_trained(tmp_path):
+    site = Site(make("fedavg", "Bandit2D", [1]), 5, tmp_path, eval_freq=None)
+    site.handle(request("setup", 0))
+    average = {name: np.zeros_like(tensor) for name, tensor in site.model.policy.client_state_dict(0).items()}
+    site.handle(request("round", 1))
+    last = site.handle(dataclasses.replace(request("round", 3, broadcast=2), payload=average))
+    parameters = {name: tensor.clone() for name, tensor in site.model.policy.client_state_dict(0).items()}
+    remedy = "gone back to an older checkpoint: .* restore the clients' folders with it, or begin a new run"
+    for again in (site, Site(make("fedavg", "Bandit2D", [1]), 5, tmp_path, eval_freq=None)):
+        for kind, round in (("round", 2), ("round", 1), ("setup", 1)):
+            with pytest.raises(ValueError, match=remedy):
+                again.handle(request(kind, round, broadcast=2))
+        with pytest.raises(ValueError, match=remedy):
+            again.handle(dataclasses.replace(request("round", 4, broadcast=1), payload=average))
+        assert again.handle(request("setup", 0)).facts == {} and again.model.round == 3 and again.n_answered == 3
+        assert_same_parameters(again.model.policy.client_state_dict(0), parameters)
+        assert again.handle(request("round", 3)).facts == last.facts
+    again.handle(dataclasses.replace(request("round", 4, broadcast=2), payload=average))  # it still goes on
+
+
+def test_a_server_that_is_restored_from_an_older_copy_moves_nobody(tmp_path):
+    config, transport = federation("fedavg", "Bandit2D", tmp_path, fresh=True)
+
+    def copy_it(round: int, figures: Any) -> None:
+        if round == 2:  # the checkpoint of round 1 is the last
+            shutil.copytree(tmp_path / "server", tmp_path / "copy")
+
+    serve(config, transport, tmp_path / "server", copy_it)
+    with pytest.raises(TooFewClients):
+        serve(config, transport, tmp_path / "copy")
+    assert_equal(transport, in_process("fedavg", "Bandit2D"))
+
+
+def test_another_version_goes_on_from_a_clients_disk(tmp_path, monkeypatch):
+    site = Site(make("fedavg", "Bandit2D", [1]), N_ROUNDS, tmp_path, eval_freq=None)
+    site.handle(request("setup", 0))
+    monkeypatch.setattr(sb3_fedguide, "__version__", "99.0")
+    again = Site(make("fedavg", "Bandit2D", [1]), N_ROUNDS, tmp_path, eval_freq=None)
+    assert again.prepared and again.handle(request("join", 0)).facts["version"] == "99.0"
 
 
 def test_a_client_that_missed_some_of_the_trunk_goes_on_with_the_others_learning_rate(tmp_path):

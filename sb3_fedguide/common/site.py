@@ -22,10 +22,10 @@ from sb3_fedguide.common.faults import in_round
 from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.common.parameters import take_prefix
 from sb3_fedguide.offline.trunk import TrunkTraining, observation_moments
-from sb3_fedguide.server.clients import WITH_SERVER, difference
+from sb3_fedguide.server.clients import OF_A_RUN, WITH_SERVER, difference
 from sb3_fedguide.server.figures import ClientEvaluation
 from sb3_fedguide.server.payload import Payload
-from sb3_fedguide.server.transport import RUN, UNPREPARED, Message
+from sb3_fedguide.server.transport import KINDS, RUN, UNPREPARED, Message
 from sb3_fedguide.server.trunk import MOMENTS, TRUNK
 
 logger = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ class Site:
 
         Whatever it raises stays here: a transport sends :meth:`~sb3_fedguide.server.transport.Failure.of` instead.
 
-        :raises ValueError: for a message of another run
+        :raises ValueError: for a message of another run, or of a server that has gone back in this one
         :raises RuntimeError: after an exception
         """
         if not self._is_usable:
@@ -122,6 +122,9 @@ class Site:
         if message.kind in ("round", "finish") or (message.kind == "setup" and message.round > 0):
             if not self.prepared:
                 return Message(message.kind, message.round, facts={UNPREPARED: True})
+        if message.kind == "setup" and message.round == 0 and self.prepared:  # the server was killed before it noted that
+            return Message("setup", 0)
+        self._refuse_older(message)
         self._is_usable = False
         self.run = message.facts[RUN]
         answer = {
@@ -134,6 +137,19 @@ class Site:
         self._save()
         self._is_usable = True
         return self._reply
+
+    def _refuse_older(self, message: Message) -> None:
+        """A server that is where it was before this client's last message would have it train twice, on what it gave since.
+
+        :raises ValueError: for its message
+        """
+        last = self._reply
+        is_older = last is not None and (KINDS.index(message.kind), message.round) < (KINDS.index(last.kind), last.round)
+        if is_older or (message.payload and message.facts.get("broadcast", self.n_received) < self.n_received):
+            raise ValueError(
+                f"the server has gone back to an older checkpoint: {message.kind} {message.round} is older than what client "
+                f"{self.client_id} has answered or received; restore the clients' folders with it, or begin a new run"
+            )
 
     def _join(self, message: Message) -> Message:
         """Nothing of it stays: a client that is refused can be put right in the same folder."""
@@ -194,7 +210,7 @@ class Site:
     def _receive(self, message: Message) -> list[dict[str, Any]]:
         """Take what the server sent, unless it came already; its evaluation, where one is due."""
         number, after = message.facts["broadcast"], message.facts["after"]
-        if not message.payload or number <= self.n_received:
+        if not message.payload or number == self.n_received:
             return []
         self._learn()
         self.model.receive(0, message.payload)
@@ -256,7 +272,7 @@ class Site:
             return
         path, state = found
         identity = self._identity()
-        if other := difference(thaw(state["identity"]), identity, identity, "here"):
+        if other := difference(thaw(state["identity"]), identity, OF_A_RUN, "here"):
             raise ValueError(f"{path} is of another run: {other}; give this one a folder of its own")
         self.n_answered = int(path.stem.removeprefix("round_"))
         self.run, self.n_received = state["run"], state["n_received"]

@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 
 Facts = dict[str, Any]
 
+#: What a run is, whatever version goes on with it.
+OF_A_RUN = ("algorithm", "seed", "n_rounds", "rollout_size", "settings")
 #: Of what client and server both state; it has to be the same.
-WITH_SERVER = ("algorithm", "version", "seed", "n_rounds", "rollout_size", "settings")
+WITH_SERVER = ("version", *OF_A_RUN)
 #: Of what only clients know; it has to be what most of those say with whom the run began.
 AMONG_CLIENTS = ("shapes", "trunk")
 
@@ -113,8 +115,9 @@ class Clients:
         return freeze({"joined": self.joined, "prepared": sorted(self.prepared), "common": self.common})
 
     def load_state(self, state: State) -> None:
+        """Everybody is asked to join again: server and clients may go on with another version."""
         saved = thaw(state)
-        self.joined, self.prepared, self.common = saved["joined"], set(saved["prepared"]), saved["common"]
+        self.prepared, self.common = set(saved["prepared"]), saved["common"]
 
 
 def _text(facts: Facts) -> str:

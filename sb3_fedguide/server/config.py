@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from sb3_fedguide.server.build import complete_settings
 from sb3_fedguide.server.participants import n_participants
+
+#: In which a run without limits ends.
+_FINISH_SECONDS = 600.0
 
 
 @dataclass(frozen=True)
@@ -26,8 +30,8 @@ class ServerConfig:
     :param start_clients: clients that are awaited before anything begins; by default all
     :param min_clients: replies without which a round does not end: those missing are asked again
     :param wait: seconds to wait for too few clients before
-        :class:`~sb3_fedguide.server.serve.TooFewClients` ends the run; 0 not to wait, ``None`` for
-        ever
+        :class:`~sb3_fedguide.server.serve.TooFewClients` ends the run; 0 not to wait, ``None`` for ever. At the end, who is
+        away is waited for no longer than this and ``timeout``, or ten minutes
     :param poll: seconds between two looks at who is there
     :raises ValueError: for values that do not fit
     """
@@ -49,6 +53,15 @@ class ServerConfig:
         for name in ("n_clients", "n_rounds", "rollout_size", "min_clients"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
+        if type(self.seed) is not int or self.seed < 0:
+            raise ValueError(f"seed={self.seed!r} must be an integer of at least 0, the clients' own")
+        for name in ("timeout", "setup_timeout"):
+            if (limit := getattr(self, name)) is not None and not 0 < limit < math.inf:
+                raise ValueError(f"{name}={limit} must be a number of seconds above 0, or None for no limit")
+        if self.wait is not None and not 0 <= self.wait < math.inf:
+            raise ValueError(f"wait={self.wait} must be a number of seconds from 0 on, or None to wait for ever")
+        if not 0 <= self.poll < math.inf:
+            raise ValueError(f"poll={self.poll} must be a number of seconds from 0 on")
         if not 1 <= self.n_start <= self.n_clients:
             raise ValueError(f"start_clients={self.start_clients} must lie between 1 and n_clients={self.n_clients}")
         present = n_participants(self.all_settings["client_fraction"], self.n_clients)
@@ -58,6 +71,11 @@ class ServerConfig:
     @property
     def n_start(self) -> int:
         return self.n_clients if self.start_clients is None else self.start_clients
+
+    @property
+    def finish_timeout(self) -> float:
+        """Seconds that the end of the run waits for who is away."""
+        return min(_FINISH_SECONDS if self.timeout is None else self.timeout, math.inf if self.wait is None else self.wait)
 
     @property
     def all_settings(self) -> dict[str, Any]:

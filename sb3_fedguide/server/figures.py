@@ -64,6 +64,7 @@ def read_evaluations(client: int, facts: Mapping[str, Any]) -> list[ClientEvalua
         except (TypeError, KeyError, ValueError, OverflowError):
             continue
         whole = bool(returns) and all(map(math.isfinite, returns)) and evaluation.policy in POLICIES
+        whole = whole and all(0 <= length < 2**53 for length in evaluation.lengths)
         if whole and all(len(values) == len(returns) for values in (lengths, successes or lengths)):
             found.append(evaluation)
     return found
@@ -81,10 +82,16 @@ def merge_figures(facts: Mapping[int, Mapping[str, Any]]) -> dict[str, float]:
         for key, value in given.items() if isinstance(given, dict) else ():
             if not isinstance(key, str) or isinstance(value, bool) or not isinstance(value, int | float):
                 continue
+            try:
+                number = float(value)
+            except OverflowError:  # an integer of any length
+                continue
+            if not math.isfinite(number):
+                continue
             if key.startswith(f"client_{client}/"):
-                merged[key] = float(value)
+                merged[key] = number
             elif not key.startswith(("client_", "federated/", "eval/")):
-                shared.setdefault(key, []).append(float(value))
+                shared.setdefault(key, []).append(number)
     return {**{key: float(np.mean(values)) for key, values in shared.items()}, **merged}
 
 

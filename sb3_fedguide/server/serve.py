@@ -15,18 +15,18 @@ from pathlib import Path
 from fed_envs.plain_data import State, freeze, thaw
 from sb3_fedguide.common.checkpoint_files import newest_checkpoint, remove_leftovers, write_checkpoint
 from sb3_fedguide.server.build import make_strategy
-from sb3_fedguide.server.clients import Clients, difference, server_facts
+from sb3_fedguide.server.clients import OF_A_RUN, Clients, difference, server_facts
 from sb3_fedguide.server.config import ServerConfig
 from sb3_fedguide.server.figures import EvaluationTable, evaluation_figures, merge_figures, read_evaluations
 from sb3_fedguide.server.payload import Payload
 from sb3_fedguide.server.rounds import Rounds, participants, payload_bytes
 from sb3_fedguide.server.transport import RUN, UNPREPARED, Failure, Kind, Message, Transport
-from sb3_fedguide.server.trunk import TrunkAverages, moments_fault
+from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_fault
 
 logger = logging.getLogger(__name__)
 
 #: What of the server a checkpoint holds as it is.
-_ATTRIBUTES = ("run_id", "round", "timesteps", "n_broadcasts", "n_setups", "outbox", "finished")
+_ATTRIBUTES = ("run_id", "round", "timesteps", "n_broadcasts", "n_setups", "outbox", "finished", "told")
 __all__ = ["Server", "ServerConfig", "TooFewClients", "serve"]
 
 CHECKPOINTS = "checkpoints"
@@ -85,28 +85,30 @@ class Server:
         self.timesteps: list[int] = []
         #: exchanges in which clients received something
         self.n_broadcasts = 0
-        #: what clients have not yet confirmed: number of the broadcast, the round it came after (0 for none), arrays
         #: tells this run from others with the same settings
         self.run_id = uuid.uuid4().hex
+        #: what clients have not yet confirmed: number of the broadcast, the round it came after (0 for none), arrays
         self.outbox: dict[int, tuple[int, int, Payload]] = {}
         #: requests that failed since the last round, by client
         self.failures: dict[int, str] = {}
         self.n_setups = 0
         self.finished = False
+        #: who has heard that the run is over
+        self.told: list[int] = []
         self._table = EvaluationTable(None if self.folder is None else self.folder / EVALUATIONS)
 
     def run(self) -> None:
         """See :func:`serve`."""
         self._resume()
-        self._await_clients()
-        self._pretrain_trunk()
-        self._prepare()
-        while self.rounds.needs_setup:
-            self._set_up()
-        while self.round < self.config.n_rounds:
-            self._play_round()
         if not self.finished:
-            self._finish()
+            self._await_clients()
+            self._pretrain_trunk()
+            self._prepare()
+            while self.rounds.needs_setup:
+                self._set_up()
+            while self.round < self.config.n_rounds:
+                self._play_round()
+        self._finish()
 
     def _await_clients(self) -> None:
         """Until enough clients with the same settings are there to begin."""
@@ -143,9 +145,11 @@ class Server:
         if self.trunk is None:
             replies = self._collect(lambda: self._to_joined(Message("moments", 0)), timeout, self._fault_of_moments)
             self._count_trunk(replies, {})
-            n_updates = max(int(reply.facts["n_updates"]) for reply in replies.values())
-            moments = {client: reply.payload for client, reply in replies.items()}
-            self.trunk = TrunkAverages(moments, n_updates, int(settings["prior_average_every"]), bound)
+            n_updates = {client: int(reply.facts["n_updates"]) for client, reply in replies.items()}
+            self._reject(excessive := excessive_updates(n_updates), "moments")
+            moments = {client: reply.payload for client, reply in replies.items() if client not in excessive}
+            longest = max(n_updates[client] for client in moments)
+            self.trunk = TrunkAverages(moments, longest, int(settings["prior_average_every"]), bound)
             self._save()
         while not self.trunk.finished:
             request = Message("trunk", self.trunk.n_averages + 1, self.trunk.payload(), self.trunk.facts())
@@ -158,7 +162,7 @@ class Server:
     def _fault_of_moments(self, reply: Message) -> str | None:
         assert self.clients.common is not None
         n_updates, shape = reply.facts.get("n_updates"), self.clients.common["shapes"]["observations"]
-        if type(n_updates) is not int or n_updates < 1:
+        if type(n_updates) is not int or not 1 <= n_updates < 2**53:
             return "it does not say how long its data are to be trained on"
         reason = moments_fault(reply.payload)
         return reason or (None if list(reply.payload["mean"].shape) == shape else f"moments of {reply.payload['mean'].shape}")
@@ -219,23 +223,32 @@ class Server:
         figures |= self.rounds.figures
         figures |= {f"client_{client}/rejected": 1.0 for client in self.rounds.rejected}
         figures["federated/participants"], figures["federated/failed"] = len(replies), len(self.failures)
-        figures["time/exchange"], figures["time/total_timesteps"] = time.perf_counter() - exchanged, self.timesteps[-1]
+        figures["time/exchange"] = time.perf_counter() - exchanged
         figures["time/round"], figures["time/server_round"] = round, time.perf_counter() - started
         self._report(round, replies, figures)
         self.failures = {}
 
     def _finish(self) -> None:
-        """Deliver what was sent last; who is away does without."""
-        self.there = set(self.transport.clients())
-        requests = self._to_prepared("finish", self.config.n_rounds, self._there())
-        replies = self._exchange(requests, self.config.timeout)
-        for client in replies:
-            self.outbox.pop(client, None)
-        self.finished = True
-        self._report(self.config.n_rounds, replies, {})
+        """Deliver what was sent last, and wait a while for those who are away; started again, it does so for who is left."""
+        started = time.monotonic()
+        while away := self.clients.prepared.difference(self.told):
+            self._welcome()
+            requests = self._to_prepared("finish", self.config.n_rounds, sorted(away.intersection(self._there())))
+            replies = self._exchange(requests, self.config.timeout)
+            for client in replies:
+                self.outbox.pop(client, None)
+            self.told += replies
+            is_late, self.finished = self.finished, True
+            if replies or not is_late:
+                self._report(self.config.n_rounds, replies, None if is_late else {})  # an average is not of the late alone
+            if time.monotonic() - started >= self.config.finish_timeout:
+                break
+            time.sleep(self.config.poll if away.difference(self.told) else 0.0)
+        if away := self.clients.prepared.difference(self.told):
+            logger.warning("clients %s have not heard that the run is over; start the server again for them", sorted(away))
 
-    def _report(self, round: int, replies: Mapping[int, Message], figures: dict[str, float]) -> None:
-        """Keep what clients measured, call the hook, and write the checkpoint."""
+    def _report(self, round: int, replies: Mapping[int, Message], figures: dict[str, float] | None) -> None:
+        """Keep what clients measured, call the hook if it is to know, and write the checkpoint."""
         evaluations = [
             evaluation
             for client, reply in sorted(replies.items())
@@ -243,9 +256,8 @@ class Server:
             if 0 < evaluation.round <= round
         ]
         self._table.add(evaluations, self.timesteps)
-        figures |= evaluation_figures(evaluations)
-        if self.on_round is not None and figures:
-            self.on_round(round, figures)
+        if self.on_round is not None and figures is not None and (figures := figures | evaluation_figures(evaluations)):
+            self.on_round(round, {**figures, "time/total_timesteps": self.timesteps[-1]})
         self._save()
 
     def _aggregate(self, round: int, replies: Mapping[int, Message]) -> None:
@@ -265,7 +277,7 @@ class Server:
 
     def _there(self) -> list[int]:
         """Who was there at the last look and is ready to train."""
-        return sorted(self.there & self.clients.prepared)
+        return sorted(self.there & self.clients.prepared & self.clients.joined.keys())
 
     def _to_prepared(self, kind: Kind, round: int, clients: Iterable[int]) -> dict[int, Message]:
         """Requests with what each client has missed."""
@@ -373,7 +385,7 @@ class Server:
         if found is None:
             return
         path, state = found
-        if other := difference(state["server"], self.clients.facts, self.clients.facts, "this server's"):
+        if other := difference(state["server"], self.clients.facts, OF_A_RUN, "this server's"):
             raise ValueError(f"{path} is the checkpoint of another federation: {other}; give this one a folder of its own")
         for name, value in thaw(state["attributes"]).items():
             setattr(self, name, value)

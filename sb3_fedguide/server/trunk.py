@@ -18,6 +18,11 @@ logger = logging.getLogger(__name__)
 #: How the names of what the server sends begin: merged observation moments, and the trunk's parameters.
 MOMENTS, TRUNK = "moments.", "trunk."
 
+#: Beyond what moments are no observations': their merged mean would be one client's alone, or overflow.
+_LARGEST, _MOST_SAMPLES = 1e12, 2**40
+#: The longest training of the trunk that one client may ask of all, in medians of the clients'.
+_MOST_UPDATES = 100
+
 
 def merge_moments(uploads: Sequence[Mapping[str, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of the union of the clients' data, from their moments alone (Chan et al. 1979)."""
@@ -58,7 +63,19 @@ def moments_fault(moments: Payload) -> str | None:
         return "they are not finite numbers of float64"
     if count.ndim != 0 or count < 1 or count != np.floor(count) or mean.ndim != 1 or mean.shape != var.shape:
         return f"their shapes are {count.shape}, {mean.shape} and {var.shape}, or there are no samples"
+    if count > _MOST_SAMPLES or (np.abs(mean) > _LARGEST).any() or (var > _LARGEST).any():
+        return f"there are more than 2**40 samples, or their mean or variance is above {_LARGEST:g}"
     return "a variance is negative" if (var < 0).any() else None
+
+
+def excessive_updates(n_updates: Mapping[int, int]) -> dict[int, str]:
+    """Clients that would have all train far longer than most say, with the reason."""
+    usual = float(np.median(list(n_updates.values())))
+    return {
+        client: f"it wants {n} updates, {n / usual:.3g} times the clients' median"
+        for client, n in n_updates.items()
+        if n > _MOST_UPDATES * usual
+    }
 
 
 class TrunkAverages:
