@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -76,3 +77,24 @@ def assert_same_parameters(a: dict[str, th.Tensor], b: dict[str, th.Tensor], tol
     for name in a:
         difference = (a[name] - b[name]).abs().max().item()
         assert difference <= tolerance, f"{name} differs by {difference}"
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a federation's server, and its authority's."""
+    from sb3_fedguide.cli.main import main
+
+    folder = tmp_path_factory.mktemp("deployment") / "certificates"
+    assert main(["deploy", "certificates", str(folder), "--host", "fed.example.org", "--host", "10.0.0.1"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def keys(certificates: Path) -> Path:
+    """The folder with two clients' keys beside the certificates."""
+    from sb3_fedguide.cli.main import main
+
+    folder = certificates.parent
+    for name in ("a", "b"):
+        assert main(["deploy", "key", str(folder), name]) == 0
+    return folder
