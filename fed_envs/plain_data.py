@@ -11,7 +11,8 @@ import numpy as np
 #: Names to arrays, JSON values, lists and states again.
 State = dict[str, Any]
 
-_TAG = "__type__"
+#: Key of a dict that stands for something else than a dict, such as a tuple or a generator.
+TAG = "__type__"
 
 
 def freeze(value: Any) -> Any:
@@ -22,28 +23,28 @@ def freeze(value: Any) -> Any:
     if value is None or isinstance(value, (bool, str)) or type(value) is int:
         return value
     if isinstance(value, np.generic):
-        return {_TAG: "scalar", "value": np.asarray(value)}
+        return {TAG: "scalar", "value": np.asarray(value)}
     if isinstance(value, int):  # an IntEnum
         return int(value)
     if isinstance(value, float):
-        return value if math.isfinite(value) else {_TAG: "float", "value": str(value)}
+        return value if math.isfinite(value) else {TAG: "float", "value": str(value)}
     if isinstance(value, np.ndarray):
         if value.dtype.hasobject:
             raise ValueError(f"an array of objects (dtype {value.dtype}) is no plain data")
         return value.copy()
     if isinstance(value, np.random.Generator):
-        return {_TAG: "generator", "value": freeze(value.bit_generator.state)}
+        return {TAG: "generator", "value": freeze(value.bit_generator.state)}
     if isinstance(value, list):
         return [freeze(item) for item in value]
     if isinstance(value, deque):
-        return {_TAG: "deque", "value": [freeze(item) for item in value], "maxlen": value.maxlen}
+        return {TAG: "deque", "value": [freeze(item) for item in value], "maxlen": value.maxlen}
     if type(value) is tuple:
-        return {_TAG: "tuple", "value": [freeze(item) for item in value]}
+        return {TAG: "tuple", "value": [freeze(item) for item in value]}
     if isinstance(value, dict):
-        if all(isinstance(key, str) for key in value) and _TAG not in value:
+        if all(isinstance(key, str) for key in value) and TAG not in value:
             return {key: _freeze_item(key, item) for key, item in value.items()}
         pairs = [[freeze(key), freeze(item)] for key, item in value.items()]
-        return {_TAG: "dict", "value": pairs}
+        return {TAG: "dict", "value": pairs}
     raise ValueError(f"a {type(value).__name__} is no plain data")
 
 
@@ -65,9 +66,9 @@ def thaw(value: Any) -> Any:
         return value.copy()
     if not isinstance(value, dict):
         return value
-    if _TAG not in value:
+    if TAG not in value:
         return {key: thaw(item) for key, item in value.items()}
-    kind, content = value[_TAG], value.get("value")
+    kind, content = value[TAG], value.get("value")
     if kind == "scalar" and isinstance(content, np.ndarray):
         return content[()]
     if kind == "float":

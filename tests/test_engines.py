@@ -15,8 +15,9 @@ from fed_envs.faults import ClientError
 from sb3_fedguide import Local
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.train import main
-from sb3_fedguide.engines import Engine, EngineError, make_engine
+from sb3_fedguide.engines import make_engine
 from sb3_fedguide.engines.client_axis import join_clients, take_clients
+from sb3_fedguide.engines.engine import Engine, EngineError
 from sb3_fedguide.engines.processes import Processes
 from sb3_fedguide.engines.worker import Worker
 from tests.test_checkpoint import same

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from sb3_fedguide.algorithms import ALGORITHMS
+from sb3_fedguide.engines import ENGINES
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -14,6 +15,16 @@ class OneLineParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+    def parse_strictly(self, argv: Sequence[str] | None) -> argparse.Namespace:
+        """Parse, and name the nearest flag for one that there is not."""
+        arguments, unknown = self.parse_known_args(argv)
+        if unknown:
+            from sb3_fedguide.cli.names import nearest
+
+            flags = [option for action in self._actions for option in action.option_strings]
+            self.error(f"unknown argument {unknown[0]!r}.{nearest(unknown[0].split('=')[0], flags)}")
+        return arguments
 
 
 def train_parser(prog: str) -> OneLineParser:
@@ -58,7 +69,7 @@ def train_parser(prog: str) -> OneLineParser:
     flag("--device", default="cpu", help="PyTorch device, e.g. cpu or cuda")
     flag("--num-threads", type=int, default=1, metavar="N", help="threads that step the simulators (PyTorch takes one: small "
          "networks gain nothing from more)")  # fmt: skip
-    flag("--engine", default="lockstep", choices=("lockstep", "processes", "ray"), help="where the clients train: all in "
+    flag("--engine", default="lockstep", choices=ENGINES, help="where the clients train: all in "
          "this process, in processes of their own, or in Ray actors; results are the same")  # fmt: skip
     flag("--num-actors", type=int, default=2, metavar="K", help="groups of clients that train at the same time, with "
          "processes or ray")  # fmt: skip
@@ -74,19 +85,10 @@ def train_parser(prog: str) -> OneLineParser:
 def parse_train(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
     """Parse, and refuse what the flags alone show to be wrong."""
     parser = train_parser(prog)
-    arguments, unknown = parser.parse_known_args(argv)
-    if unknown:
-        flags = [option for action in parser._actions for option in action.option_strings]
-        parser.error(_unknown(unknown[0], flags))
+    arguments = parser.parse_strictly(argv)
     for problem in _problems(arguments):
         parser.error(problem)
     return arguments
-
-
-def _unknown(argument: str, flags: Sequence[str]) -> str:
-    from sb3_fedguide.cli.names import nearest
-
-    return f"unknown argument {argument!r}.{nearest(argument.split('=')[0], flags)}"
 
 
 def _problems(arguments: Any) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import OneLineParser, train_parser
-from sb3_fedguide.cli.names import check_names, nearest
+from sb3_fedguide.cli.names import check_names
 
 #: Flags of the training command that say what a run computes, and that a run which goes on has in its own settings.
 SETTINGS = ("dataset", "rounds", "n_envs_per_client", "conf_file", "hyperparams")
@@ -58,10 +58,7 @@ def benchmark_parser(prog: str) -> OneLineParser:
 def parse_benchmark(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
     """Parse, and refuse what the flags alone show to be wrong."""
     parser = benchmark_parser(prog)
-    arguments, unknown = parser.parse_known_args(argv)
-    if unknown:
-        options = [option for action in parser._actions for option in action.option_strings]
-        parser.error(f"unknown argument {unknown[0]!r}.{nearest(unknown[0].split('=')[0], options)}")
+    arguments = parser.parse_strictly(argv)
     try:
         _check(arguments)
     except ValueError as error:

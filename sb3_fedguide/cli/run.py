@@ -134,7 +134,8 @@ class Run:
         from sb3_fedguide.cli.recorder import CostCallback, DeployedCallback, RunEvalCallback, StopCallback
         from sb3_fedguide.cli.run_folder import CHECKPOINTS, EVALUATIONS
         from sb3_fedguide.common.checkpoint import CheckpointCallback
-        from sb3_fedguide.engines import EngineError, make_engine
+        from sb3_fedguide.engines import make_engine
+        from sb3_fedguide.engines.engine import EngineError
 
         arguments, model = self.arguments, self.model
         self._costs, self._deployed, self._evaluation = CostCallback(), DeployedCallback(), None

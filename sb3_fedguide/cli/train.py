@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
         print(f"{prog}: interrupted before the run began", file=sys.stderr)
         return EXIT_INTERRUPTED
     from fed_envs.faults import ClientError
-    from sb3_fedguide.engines import EngineError
+    from sb3_fedguide.engines.engine import EngineError
 
     try:
         with _no_reports_of_threads(), _short_warnings(prog):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fed_envs.plain_data import State
+from fed_envs.plain_data import TAG, State
 from sb3_fedguide.common.array_files import read_arrays, write_arrays
 
 #: How many checkpoints stay: the newest may turn out to be damaged.
@@ -21,7 +21,6 @@ KEPT = 2
 #: Raised whenever what a checkpoint holds changes, so that another version's is refused.
 FORMAT = 2
 _JSON = "state.json"
-_TAG = "__type__"  # as in fed_envs.plain_data, which keeps it out of the states' own keys
 _NAME = re.compile(r"round_(\d+)\.npz")
 
 
@@ -110,12 +109,12 @@ def _without_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any
     while name in arrays:  # keys may contain slashes
         name += "_"
     arrays[name] = value
-    return {_TAG: "array", "name": name}
+    return {TAG: "array", "name": name}
 
 
 def _with_arrays(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, dict):
-        if value.get(_TAG) == "array":
+        if value.get(TAG) == "array":
             return arrays[value["name"]]
         return {key: _with_arrays(item, arrays) for key, item in value.items()}
     if isinstance(value, list):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from sb3_fedguide.engines.engine import Engine, EngineError
+from typing import TYPE_CHECKING
 
-__all__ = ["ENGINES", "Engine", "EngineError", "make_engine"]
+if TYPE_CHECKING:
+    from sb3_fedguide.engines.engine import Engine
+
+__all__ = ["ENGINES", "make_engine"]
 
 #: Names on the command line; ``lockstep`` is no engine: all clients train in the process itself.
 ENGINES = ("lockstep", "processes", "ray")

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from fed_envs.plain_data import TAG
 from fed_envs.state import State
 
 __all__ = ["join_clients", "take_clients"]
-
-_TAG = "__type__"  # as in fed_envs.state: tuples, generators and the like are one thing and not one per client
 
 
 def take_clients(state: State, positions: Sequence[int], n_clients: int, shared: Collection[str]) -> State:
@@ -57,10 +56,10 @@ def _walk(values: Sequence[Any], path: str, shared: set[str], combine: Callable[
     if isinstance(first, np.ndarray):
         return combine(values, path)
     if isinstance(first, dict):
-        if first.get(_TAG) == "dict":
+        if first.get(TAG) == "dict":
             pairs = [[key, _walk(items, f"{path}.{key}", shared, combine)] for key, items in _pairs(values)]
-            return {_TAG: "dict", "value": pairs}
-        if _TAG in first:
+            return {TAG: "dict", "value": pairs}
+        if TAG in first:
             return first
         return {key: _walk([value[key] for value in values], _join(path, key), shared, combine) for key in first}
     if path.startswith("optimizers"):  # a list of optimisers, and of parameters in each
