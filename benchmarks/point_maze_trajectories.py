@@ -58,8 +58,7 @@ def read_run(folder: Path) -> tuple[str, Family, Any]:
     if family.world != "point_maze":
         raise ValueError(f"{folder} is a run on {family.name}; only PointMaze families have mazes to draw")
     model = saved_run.load_model(folder, config, family)
-    deployed = {name: th.as_tensor(array) for name, array in saved_run.read_deployed_policies(folder, model).items()}
-    model.policy.load_state_dict({**model.policy.state_dict(), **deployed})
+    model.set_acting_arrays(saved_run.read_deployed_policies(folder, model))
     return summary["algo"], family, model
 
 

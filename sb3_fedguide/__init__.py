@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sb3_fedguide.algorithms import register_algorithm
     from sb3_fedguide.algorithms.fedavg import FedAvg
     from sb3_fedguide.algorithms.fedguide import FedGuide, FedGuideA, FedGuideP
+    from sb3_fedguide.algorithms.fedguide_r import FedGuideR
     from sb3_fedguide.algorithms.fedkl import FedKL
     from sb3_fedguide.algorithms.fedprox import FedProx
     from sb3_fedguide.algorithms.fedrl import FedRL
@@ -34,6 +35,7 @@ _LAZY = {
     "FedGuide": "sb3_fedguide.algorithms.fedguide",
     "FedGuideA": "sb3_fedguide.algorithms.fedguide",
     "FedGuideP": "sb3_fedguide.algorithms.fedguide",
+    "FedGuideR": "sb3_fedguide.algorithms.fedguide_r",
     "FedKL": "sb3_fedguide.algorithms.fedkl",
     "FedProx": "sb3_fedguide.algorithms.fedprox",
     "FedRL": "sb3_fedguide.algorithms.fedrl",
@@ -53,6 +55,7 @@ __all__ = [
     "FedGuide",
     "FedGuideA",
     "FedGuideP",
+    "FedGuideR",
     "FedKL",
     "FedProx",
     "FedRL",

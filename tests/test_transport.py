@@ -49,7 +49,8 @@ def exact_plan(cost: np.ndarray, eta: float, log_v: np.ndarray) -> np.ndarray:
 
     solution = root(columns, log_v[:-1], jac=jacobian, tol=1e-14)
     mass = plan(np.append(solution.x, log_v[-1]))
-    assert np.abs(mass.sum(axis=0) - 1 / m).max() < 1e-10 / n
+    # MINPACK stops where rounding ends its progress, on some processors at 1e-10; plans are compared with 3e-5 / n
+    assert np.abs(mass.sum(axis=0) - 1 / m).max() < 1e-7 / n
     return mass
 
 

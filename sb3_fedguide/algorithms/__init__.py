@@ -20,6 +20,7 @@ ALGORITHMS: dict[str, tuple[str, str]] = {
     "fedguide": ("sb3_fedguide.algorithms.fedguide", "FedGuide"),
     "fedguide-p": ("sb3_fedguide.algorithms.fedguide", "FedGuideP"),
     "fedguide-a": ("sb3_fedguide.algorithms.fedguide", "FedGuideA"),
+    "fedguide-r": ("sb3_fedguide.algorithms.fedguide_r", "FedGuideR"),
 }
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal, Unpack
 
+from stable_baselines3.common.type_aliases import Schedule
+
 from sb3_fedguide.common.arguments import FederatedPPOArguments
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
@@ -12,18 +14,13 @@ from sb3_fedguide.server.averaging import Aggregator
 
 
 class FedAvg(ParameterAveraging, FederatedPPO):
-    """PPO with federated averaging of actor and critic; optimiser state and normalisation stay with their client.
+    """PPO with federated averaging of actor and critic; optimiser state stays with its client.
 
     Paper: https://arxiv.org/abs/1602.05629
 
-    :param average: ``"all"``, only the ``"actor"`` (with ``log_std``), or only the ``"critic"``
-    :param average_every: average after every so many rounds
-    :param average_until: last round after which to average; ``None`` for no end
-    :param aggregator: ``"mean"``, or coordinate by coordinate the ``"median"`` or a ``"trimmed_mean"``, which a minority of
-        wrong uploads cannot move far; both ignore numbers of samples
-    :param trim_fraction: share of the clients that ``"trimmed_mean"`` leaves out at either end
-
-    All other parameters are those of :class:`FederatedPPO`.
+    ``average``, ``average_every``, ``average_until``, ``aggregator``, ``trim_fraction``, ``server_step``, ``server_momentum``,
+    ``mix`` and ``screening`` are those of :class:`~sb3_fedguide.common.parameter_averaging.ParameterAveraging`, all other
+    parameters those of :class:`FederatedPPO`.
     """
 
     server_method = "fedavg"
@@ -37,7 +34,13 @@ class FedAvg(ParameterAveraging, FederatedPPO):
         average_until: int | None = None,
         aggregator: Aggregator = "mean",
         trim_fraction: float = 0.25,
+        server_step: float | Literal["exp"] = 1.0,
+        server_momentum: float = 0.0,
+        mix: float | Schedule = 1.0,
+        screening: float = 0.0,
         **ppo: Unpack[FederatedPPOArguments],
     ) -> None:
-        self._init_averaging(average, average_every, average_until, aggregator, trim_fraction)
+        self._init_averaging(
+            average, average_every, average_until, aggregator, trim_fraction, server_step, server_momentum, mix, screening
+        )
         super().__init__(policy, env, **ppo)

@@ -15,8 +15,7 @@ from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.arguments import FederatedPPOArguments
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
-from sb3_fedguide.common.parameter_averaging import policy_upload
-from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES
+from sb3_fedguide.common.parameter_averaging import ParameterAveraging
 from sb3_fedguide.common.rollout_buffer import FederatedSamples, generalized_advantage
 from sb3_fedguide.common.seeding import Role
 from sb3_fedguide.common.stacked import to_arrays, to_tensors
@@ -27,7 +26,7 @@ from sb3_fedguide.priors.adaptation import HeadAdaptation
 from sb3_fedguide.priors.base import Prior, score_cost
 from sb3_fedguide.priors.importance import importance_weights
 from sb3_fedguide.priors.mixture import mixture_log_prob, mixture_sample
-from sb3_fedguide.server.averaging import averaging_is_due, check_averaging
+from sb3_fedguide.server.averaging import Aggregator
 from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW
 from sb3_fedguide.server.strategy import Payload
 
@@ -358,37 +357,34 @@ class FedGuideP(FedGuide):
     uses_dice: ClassVar[bool] = False
 
 
-class FedGuideA(FedGuide):
+class FedGuideA(ParameterAveraging, FedGuide):
     """FedGuide-A: FedGuide whose actors (with ``log_std``) are averaged every few rounds; critics stay local.
 
-    :param average_every: average the actors after rounds ``average_every``, ``2 * average_every``, ...
-
-    All other parameters are those of :class:`FedGuide`.
+    ``average_every``, ``average_until``, ``aggregator``, ``trim_fraction``, ``server_step``, ``server_momentum``, ``mix`` and
+    ``screening`` are those of :class:`~sb3_fedguide.common.parameter_averaging.ParameterAveraging`, all other parameters those
+    of :class:`FedGuide`.
     """
 
     server_method = "fedguide-a"
 
-    def __init__(self, policy: PolicyLike, env: FederationLike | None, average_every: int = 5, **fedguide: object) -> None:
-        check_averaging("actor", average_every)
-        self.average_every = average_every
+    def __init__(
+        self,
+        policy: PolicyLike,
+        env: FederationLike | None,
+        average_every: int = 5,
+        average_until: int | None = None,
+        aggregator: Aggregator = "mean",
+        trim_fraction: float = 0.25,
+        server_step: float | Literal["exp"] = 1.0,
+        server_momentum: float = 0.0,
+        mix: float | Schedule = 1.0,
+        screening: float = 0.0,
+        **fedguide: object,
+    ) -> None:
+        self._init_averaging(
+            "actor", average_every, average_until, aggregator, trim_fraction, server_step, server_momentum, mix, screening
+        )
         super().__init__(policy, env, **fedguide)  # type: ignore[arg-type]
-
-    def sends_policy(self, round: int) -> bool:
-        return averaging_is_due(round, self.average_every)
-
-    def upload(self, index: int) -> Payload:
-        payload = super().upload(index)
-        if self.sends_policy(self.round):
-            payload.update(policy_upload(self, index, ACTOR_PREFIXES))
-        return payload
-
-    def upload_shapes(self) -> dict[str, list[int]]:
-        actor = policy_upload(self, 0, ACTOR_PREFIXES)
-        return super().upload_shapes() | {name: list(array.shape) for name, array in actor.items()}
-
-    def receive(self, index: int, broadcast: Payload) -> None:
-        super().receive(index, broadcast)
-        self.policy.load_client(index, {name: array for name, array in broadcast.items() if name.startswith(ACTOR_PREFIXES)})
 
 
 def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

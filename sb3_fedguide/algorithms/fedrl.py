@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, Unpack
 
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_fedguide.common.arguments import FederatedDDPGArguments
@@ -21,14 +22,9 @@ class FedRL(ParameterAveraging, FederatedDDPG):
 
     Paper: https://arxiv.org/abs/2204.02634
 
-    :param average: ``"all"``, only the ``"actor"``, or only the ``"critic"``
-    :param average_every: average after every so many rounds
-    :param average_until: last round after which to average; ``None`` for no end
-    :param aggregator: ``"mean"``, or coordinate by coordinate the ``"median"`` or a ``"trimmed_mean"``, which a minority of
-        wrong uploads cannot move far; both ignore numbers of samples
-    :param trim_fraction: share of the clients that ``"trimmed_mean"`` leaves out at either end
-
-    All other parameters are those of :class:`FederatedDDPG`.
+    ``average``, ``average_every``, ``average_until``, ``aggregator``, ``trim_fraction``, ``server_step``, ``server_momentum``,
+    ``mix`` and ``screening`` are those of :class:`~sb3_fedguide.common.parameter_averaging.ParameterAveraging`, all other
+    parameters those of :class:`FederatedDDPG`.
     """
 
     server_method = "fedrl"
@@ -42,9 +38,15 @@ class FedRL(ParameterAveraging, FederatedDDPG):
         average_until: int | None = None,
         aggregator: Aggregator = "mean",
         trim_fraction: float = 0.25,
+        server_step: float | Literal["exp"] = 1.0,
+        server_momentum: float = 0.0,
+        mix: float | Schedule = 1.0,
+        screening: float = 0.0,
         **ddpg: Unpack[FederatedDDPGArguments],
     ) -> None:
-        self._init_averaging(average, average_every, average_until, aggregator, trim_fraction)
+        self._init_averaging(
+            average, average_every, average_until, aggregator, trim_fraction, server_step, server_momentum, mix, screening
+        )
         super().__init__(policy, env, **ddpg)
 
     def receive(self, index: int, broadcast: Payload) -> None:

@@ -107,14 +107,12 @@ def _policies(arguments: argparse.Namespace, folder: Path, model: Federation) ->
 @contextmanager
 def _in_place(model: Federation, arrays: dict[str, np.ndarray]) -> Iterator[None]:
     """The model with other parameters for a while."""
-    import torch as th
-
-    before = {name: tensor.clone() for name, tensor in model.policy.state_dict().items()}
-    model.policy.load_state_dict({**before, **{name: th.as_tensor(array) for name, array in arrays.items()}})
+    before = model.acting_arrays()
+    model.set_acting_arrays(arrays)
     try:
         yield
     finally:
-        model.policy.load_state_dict(before)
+        model.set_acting_arrays(before)
 
 
 def _evaluate(

@@ -11,7 +11,6 @@ from sb3_fedguide.cli.signals import StopSignals
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.evaluation import Evaluation, FederatedEvalCallback
-from sb3_fedguide.common.stacked import to_arrays
 
 TIMES = ("rollout", "train", "exchange")
 
@@ -71,11 +70,11 @@ class DeployedCallback(RoundCallback):
         self._state: dict[str, np.ndarray] = {}
 
     def _on_local_training_end(self) -> None:
-        self._state = to_arrays(self.model.policy.state_dict())
+        self._state = self.model.acting_arrays()
 
     def replaced(self) -> dict[str, np.ndarray]:
         """The deployed policies' parameters where they differ from the model's own, else nothing."""
-        now = to_arrays(self.model.policy.state_dict())
+        now = self.model.acting_arrays()
         same = all(np.array_equal(array, now[name]) for name, array in self._state.items())
         return {} if same else self._state
 
@@ -104,17 +103,21 @@ class StopCallback(RoundCallback):
 class RunEvalCallback(FederatedEvalCallback):
     """Keeps the average return of every evaluation, and the seconds they took."""
 
-    state_attributes = ("seconds", "curves")
+    state_attributes = ("seconds", "curves", "client_curves")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.seconds = 0.0
         #: policy to ``[round, client-average return]`` of each evaluation
         self.curves: dict[str, list[tuple[int, float]]] = {}
+        #: policy to ``[round, environment steps of all clients, each client's return]`` of each evaluation
+        self.client_curves: dict[str, list[tuple[int, int, list[float]]]] = {}
 
     def _evaluate(self, policy: str, round: int) -> Evaluation:
         started = time.perf_counter()
         evaluation = super()._evaluate(policy, round)
         self.seconds += time.perf_counter() - started
         self.curves.setdefault(policy, []).append((round, evaluation.average))
+        returns = [float(f"{value:.6g}") for value in evaluation.client_returns]
+        self.client_curves.setdefault(policy, []).append((round, self.model.environment_steps, returns))
         return evaluation

@@ -33,7 +33,8 @@ def summarize(
         "clients": model.client_ids,
         "rounds_done": model.round,
         "finished": model.round >= identity["n_rounds"],
-        "timesteps": model.num_timesteps,
+        "timesteps": model.environment_steps,
+        "test_timesteps": model.test_steps,
         "bytes_up": costs.bytes_up,
         "bytes_down": costs.bytes_down,
         "seconds": {
@@ -55,6 +56,7 @@ def summarize(
             "success_rates": rates.tolist() if (rates := evaluated[policy].success_rates) is not None else None,
             "n_episodes": int(evaluated[policy].returns.shape[1]),
             "curve": [list(point) for point in evaluation.curves[policy]] if evaluation is not None else [],
+            "client_curve": [list(point) for point in evaluation.client_curves[policy]] if evaluation is not None else [],
         }
     return result
 

@@ -124,7 +124,7 @@ class Run:
         loud = arguments.verbose == 2 or (arguments.verbose == 1 and not arguments.progress)
         events_output = TensorBoardOutputFormat(str(events))
         if self.folder is not None:
-            forget_later_events(events_output, self.model.num_timesteps)
+            forget_later_events(events_output, self.model.environment_steps)
         outputs: list[KVWriter] = [events_output]
         if loud:
             outputs.append(HumanOutputFormat(sys.stdout))

@@ -73,10 +73,9 @@ def read_deployed_policies(folder: Path, model: Federation) -> dict[str, np.ndar
 
     from sb3_fedguide.cli.run_folder import DEPLOYED, read_deployed
     from sb3_fedguide.common.array_files import array_mismatches
-    from sb3_fedguide.common.stacked import to_arrays
 
     deployed = read_deployed(folder)
-    if deployed and (mismatches := array_mismatches(deployed, to_arrays(model.policy.state_dict()))):
+    if deployed and (mismatches := array_mismatches(deployed, model.acting_arrays())):
         raise ValueError(f"{folder / DEPLOYED} does not fit the run's policies: {mismatches[0]}")
     if broken := [name for name, array in deployed.items() if not np.isfinite(array).all()]:
         raise ValueError(f"{folder / DEPLOYED}: {broken[0]} has non-finite entries")

@@ -9,6 +9,7 @@ from typing import Any, TypedDict
 import torch as th
 from stable_baselines3.common.type_aliases import Schedule
 
+from sb3_fedguide.common.normalization import Normalize
 from sb3_fedguide.offline.config import PretrainingConfig
 
 
@@ -22,7 +23,7 @@ class FederationArguments(TypedDict, total=False):
     n_envs_per_client: int
     clients: Sequence[int] | None
     num_threads: int
-    normalize: bool
+    normalize: Normalize
     bc_weight: float
     client_fraction: float
     upload_bound: float | None

@@ -135,8 +135,8 @@ class ExchangeCallback(RoundCallback):
         model = self.model
         if model.delays is not None:
             model.take_part(model.delays.begin(model.round, model.client_fraction))
-        for index in np.flatnonzero(model.present & model.outdated).tolist():
-            model.receive(index, self.server.catch_up(model.client_ids[index]))
+        missing = np.flatnonzero(model.present & model.outdated).tolist()
+        model.take_broadcasts({index: self.server.catch_up(model.client_ids[index]) for index in missing})
         self._remember_outdated()
 
     def _on_round_end(self) -> None:
@@ -153,10 +153,9 @@ class ExchangeCallback(RoundCallback):
         model = self.model
         started = time.perf_counter()
         present = {client: index for index, client in enumerate(model.client_ids) if uploading[index]}
-        uploads = {client: model.upload(index) for client, index in present.items()}
+        uploads = {client: model.outgoing(index) for client, index in present.items()}
         broadcasts = self.server.exchange(model.round, uploads, set(model.client_ids) - present.keys())
-        for client, broadcast in broadcasts.items():
-            model.receive(present[client], broadcast)
+        model.take_broadcasts({present[client]: broadcast for client, broadcast in broadcasts.items()})
         for client, reason in self.server.rejected.items():
             warnings.warn(f"round {model.round}: the server rejects the upload of client {client}: {reason}", stacklevel=1)
             model.record_client(client, "rejected", 1.0)

@@ -62,16 +62,20 @@ def evaluation_env(federation: Federation, n_episodes: int) -> FederatedVecEnv:
 
 
 def evaluate_federation(
-    predict: Callable[[np.ndarray], np.ndarray], env: FederatedVecEnv, seed: int = EVALUATION_SEED
+    predict: Callable[[np.ndarray], np.ndarray],
+    env: FederatedVecEnv,
+    seed: int = EVALUATION_SEED,
+    active: np.ndarray | None = None,
 ) -> Evaluation:
     """Run one seeded episode in every copy of every client's environment.
 
     :param predict: actions for observations ``(num_envs, obs_dim)``, client-major
     :param env: one copy per client and episode
     :param seed: of the episodes
+    :param active: ``(n_clients, n_episodes)`` bool, which of them to run; all if ``None``. Of the others nothing is known
     """
     env.seed(seed)
-    env.active[:] = True
+    env.active[:] = True if active is None else active.reshape(-1)
     obs: Any = env.reset()
     returns, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)
     successes: dict[int, bool] = {}
@@ -83,7 +87,7 @@ def evaluate_federation(
                 successes[int(index)] = bool(infos[index]["is_success"])
         env.active[dones] = False
     shape = (env.n_clients, env.n_envs_per_client)
-    succeeded = np.array([successes[index] for index in range(env.num_envs)]).reshape(shape) if successes else None
+    succeeded = np.array([successes.get(index, False) for index in range(env.num_envs)]).reshape(shape) if successes else None
     return Evaluation(returns.reshape(shape), lengths.reshape(shape), succeeded)
 
 
@@ -197,6 +201,6 @@ class FederatedEvalCallback(RoundCallback):
         success = [""] * len(evaluation.returns) if rates is None else [f"{rate:.6g}" for rate in rates]
         clients = zip(self.model.client_ids, evaluation.returns, evaluation.lengths, success, strict=True)
         return [
-            (round, self.model.num_timesteps, policy, client, f"{r.mean():.6g}", f"{r.std():.6g}", f"{n.mean():.6g}", rate)
+            (round, self.model.environment_steps, policy, client, f"{r.mean():.6g}", f"{r.std():.6g}", f"{n.mean():.6g}", rate)
             for client, r, n, rate in clients
         ]

@@ -23,7 +23,7 @@ from sb3_fedguide.common.export import client_ddpg, export_program
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation, FederationLike, as_federated_env
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
-from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.replay_buffer import FederatedReplayBuffer
 from sb3_fedguide.common.seeding import Role, integer_seed
@@ -61,7 +61,8 @@ class FederatedDDPG(Federation, DDPG):
     :param n_envs_per_client: environments per client; must divide ``rollout_size``
     :param clients: ids of the clients that live here; all by default
     :param num_threads: at most so many threads step the simulators, see :class:`fed_envs.FederatedVecEnv`
-    :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client
+    :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client; with ``"shared"`` the
+        clients pool their observation statistics through the server after every round
     :param bc_weight: alpha of ``theta_0 = (1 - alpha) theta_rand + alpha theta_BC`` for the actor (paper: 0.3)
     :param client_fraction: share of the clients that take part in each round, as for :class:`FederatedPPO`
     :param upload_bound: as for :class:`FederatedPPO`
@@ -98,7 +99,7 @@ class FederatedDDPG(Federation, DDPG):
         n_envs_per_client: int = 1,
         clients: Sequence[int] | None = None,
         num_threads: int = 1,
-        normalize: bool = False,
+        normalize: Normalize = False,
         bc_weight: float = 0.0,
         client_fraction: float = 1.0,
         upload_bound: float | None = UPLOAD_BOUND,
@@ -166,8 +167,9 @@ class FederatedDDPG(Federation, DDPG):
             self.n_envs_per_client,
             self.observation_space.shape[0],  # type: ignore[index]
             self.gamma,
-            norm_obs=self.normalize,
-            norm_reward=self.normalize,
+            norm_obs=bool(self.normalize),
+            norm_reward=bool(self.normalize),
+            shared=self.normalize == "shared",
         )
         self._start_server()
 

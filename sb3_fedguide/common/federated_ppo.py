@@ -20,7 +20,7 @@ from fed_envs import FederatedVecEnv
 from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation, FederationLike, PolicyLike, as_federated_env
-from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 from sb3_fedguide.common.rollout_buffer import FederatedRolloutBuffer, FederatedSamples, check_sizes, generalized_advantage
@@ -54,7 +54,8 @@ class FederatedPPO(Federation, PPO):
     :param n_envs_per_client: environments per client; must divide ``rollout_size``
     :param clients: ids of the clients that live here; all by default
     :param num_threads: at most so many threads step the simulators, see :class:`fed_envs.FederatedVecEnv`
-    :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client
+    :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client; with ``"shared"`` the
+        clients pool their observation statistics through the server after every round
     :param bc_weight: alpha of ``theta_0 = (1 - alpha) theta_rand + alpha theta_BC`` for the actor (paper: 0.3)
     :param client_fraction: share of the clients that take part in each round, drawn by the server; the others keep all of
         their state, and receive what they missed before they train again
@@ -91,7 +92,7 @@ class FederatedPPO(Federation, PPO):
         n_envs_per_client: int = 1,
         clients: Sequence[int] | None = None,
         num_threads: int = 1,
-        normalize: bool = False,
+        normalize: Normalize = False,
         bc_weight: float = 0.0,
         client_fraction: float = 1.0,
         upload_bound: float | None = UPLOAD_BOUND,
@@ -160,8 +161,9 @@ class FederatedPPO(Federation, PPO):
             self.n_envs_per_client,
             self.observation_space.shape[0],  # type: ignore[index]
             self.gamma,
-            norm_obs=self.normalize,
-            norm_reward=self.normalize,
+            norm_obs=bool(self.normalize),
+            norm_reward=bool(self.normalize),
+            shared=self.normalize == "shared",
         )
         self._start_server()
 

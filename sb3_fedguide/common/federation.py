@@ -23,9 +23,10 @@ from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback, RoundProgressCallback, round_callbacks
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
+from sb3_fedguide.common.exchange import Exchange
 from sb3_fedguide.common.export import client_model, export_client
 from sb3_fedguide.common.faults import check_policies, in_round
-from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize, check_normalize
 from sb3_fedguide.common.parameters import ParameterFiles
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
@@ -33,9 +34,8 @@ from sb3_fedguide.common.resumable import Resumable
 from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.common.warm_start import WarmStart
 from sb3_fedguide.offline.pretraining import PretrainingConfig
-from sb3_fedguide.server.build import COMMON, find_method, make_strategy
 from sb3_fedguide.server.participants import check_fraction, draw_participants, n_participants
-from sb3_fedguide.server.strategy import Payload, Strategy
+from sb3_fedguide.server.strategy import Strategy
 from sb3_fedguide.server.validation import UPLOAD_BOUND, check_bound
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ FederationLike = str | Path | Any | Sequence[Callable[[], gym.Env]]
 SelfFederation = TypeVar("SelfFederation", bound="Federation")
 
 
-class Federation(WarmStart, ParameterFiles, Resumable):
+class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
     """Mixin for SB3 algorithms that train all clients of a family in lockstep.
 
     A method names the server's side in :attr:`server_method` (or makes it, with :meth:`_make_strategy`), and defines the
@@ -54,8 +54,6 @@ class Federation(WarmStart, ParameterFiles, Resumable):
     """
 
     policy: StackedMlpPolicy | StackedDDPGPolicy  # type: ignore[assignment]
-    #: name of the server's side in :data:`sb3_fedguide.server.build.METHODS`
-    server_method: ClassVar[str] = "local"
     normalizer: FederatedNormalizer
     rollout_size: int
     gamma: float
@@ -63,7 +61,7 @@ class Federation(WarmStart, ParameterFiles, Resumable):
     def _init_federation(
         self,
         env: FederatedVecEnv | None,
-        normalize: bool,
+        normalize: Normalize,
         bc_weight: float,
         pretraining: PretrainingConfig | dict[str, Any] | None,
         cache_dir: str | Path | None,
@@ -72,6 +70,7 @@ class Federation(WarmStart, ParameterFiles, Resumable):
     ) -> None:
         """Called by a subclass's constructor, before SB3's."""
         check_fraction(client_fraction)
+        check_normalize(normalize)
         if not 0.0 <= bc_weight <= 1.0:
             raise ValueError(f"bc_weight={bc_weight} must lie in [0, 1]")
         self.client_ids: list[int] = [] if env is None else list(env.client_ids)
@@ -92,7 +91,11 @@ class Federation(WarmStart, ParameterFiles, Resumable):
         self.present = np.ones(self.n_clients, dtype=bool)
         #: who missed the last exchange and receives what the server last sent before training again
         self.outdated = np.zeros(self.n_clients, dtype=bool)
+        #: who has ever trained: a newcomer begins with all of what the server sends
+        self.has_trained = np.zeros(self.n_clients, dtype=bool)
         self.round = 0
+        #: environment steps of tests (:mod:`sb3_fedguide.common.screening`), which ``num_timesteps`` leaves out
+        self.test_steps = 0
         self.pretrained = False
         #: bytes that all clients together sent and received in the offline stage
         self.pretraining_bytes = (0, 0)
@@ -110,6 +113,11 @@ class Federation(WarmStart, ParameterFiles, Resumable):
     def n_clients(self) -> int:
         """Clients that live here."""
         return len(self.client_ids)
+
+    @property
+    def environment_steps(self) -> int:
+        """Steps of all clients together, in training and in tests of what the server sent."""
+        return self.num_timesteps + self.test_steps
 
     @property
     def n_participants(self) -> int:
@@ -169,37 +177,6 @@ class Federation(WarmStart, ParameterFiles, Resumable):
             if isinstance(optimizer, ParticipationAdam):
                 optimizer.make_state()
 
-    def sends_policy(self, round: int) -> bool:
-        """Whether the exchange after round ``round`` replaces the clients' policies; what it sent is evaluated as well."""
-        return False
-
-    def _start_server(self) -> None:
-        """Make the server's side, unless it came with a saved model."""
-        if self.strategy is None:
-            self.strategy = self._make_strategy()
-            if self.strategy is not None:
-                self.strategy.upload_bound = self.upload_bound
-
-    def _make_strategy(self) -> Strategy | None:
-        """The server's side of this method; ``None`` where nothing is exchanged."""
-        assert self.seed is not None
-        return make_strategy(self.server_method, self.server_settings(), self.n_clients, self.seed)
-
-    def server_settings(self) -> dict[str, Any]:
-        """What the server of this method has to know, by the names of the constructor's parameters."""
-        return {name: getattr(self, name) for name in (*COMMON, *find_method(self.server_method).defaults)}
-
-    def upload(self, index: int) -> Payload:
-        """What the client at position ``index`` sends: float32 arrays and nothing else."""
-        return {}
-
-    def receive(self, index: int, broadcast: Payload) -> None:
-        """Take what the server sent to the client at position ``index``."""
-
-    def upload_shapes(self) -> dict[str, list[int]]:
-        """Shapes of what a client uploads by name, known before the offline stage; what only comes later is left out."""
-        return {name: list(array.shape) for name, array in self.upload(0).items()}
-
     def learn(
         self: SelfFederation,
         total_timesteps: int,
@@ -243,7 +220,7 @@ class Federation(WarmStart, ParameterFiles, Resumable):
                 tb_log_name or type(self).__name__,
             )
         if reset_num_timesteps:
-            self.round = 0
+            self.round = self.test_steps = 0
         self._begin_learning(environments_were_reset=reset)
         rounds = list(round_callbacks(callbacks))
         self._resume_callbacks(rounds)
@@ -258,6 +235,7 @@ class Federation(WarmStart, ParameterFiles, Resumable):
         if not (self.train_locally(callbacks) if self.engine is None else self.engine.train_round(self, callbacks)):
             return False
         check_policies(self.client_ids, self.policy)
+        self.has_trained |= self.present
         for hook in rounds:
             hook.on_local_training_end()
         self.round += 1
@@ -272,6 +250,7 @@ class Federation(WarmStart, ParameterFiles, Resumable):
 
         :raises ClientError: where a client's environment or policy broke
         """
+        self.normalizer.begin_round(self.present)
         try:
             return self._train_round(callbacks)
         except ClientError:
@@ -323,8 +302,8 @@ class Federation(WarmStart, ParameterFiles, Resumable):
         self.logger.record("time/round", iteration)
         self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
         self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(step=self.num_timesteps)
+        self.logger.record("time/total_timesteps", self.environment_steps, exclude="tensorboard")
+        self.logger.dump(step=self.environment_steps)
 
     def record_client(self, client_id: int, key: str, value: float) -> None:
         """Log one client's value; kept off the terminal, where long keys collide and eight clients drown the rest."""

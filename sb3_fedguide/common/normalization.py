@@ -1,15 +1,28 @@
 """Running normalisation of observations and rewards: ``VecNormalize``'s semantics, with statistics per client.
 
-The statistics are private to their client. They are kept with the model and not in an environment wrapper, so that
-``predict``, ``save`` and ``client(k)`` take raw observations, and priors and DICE values see them raw.
+The statistics are private to their client, unless those of observations are shared: then each round's moments go to the
+server, and what all clients together have observed comes back. They are kept with the model and not in an environment
+wrapper, so that ``predict``, ``save`` and ``client(k)`` take raw observations, and priors and DICE values see them raw.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 import torch as th
+
+from sb3_fedguide.server.payload import OBSERVATION_COUNT, OBSERVATION_MEAN, OBSERVATION_VAR, Payload
+
+#: Nothing, statistics per client, or observation statistics that all clients share.
+Normalize = bool | Literal["shared"]
+
+
+def check_normalize(normalize: Normalize) -> None:
+    """:raises ValueError: for what is none of the choices"""
+    if normalize not in (True, False, "shared"):
+        raise ValueError(f"normalize={normalize!r} must be True, False or 'shared' (observation statistics of all clients)")
 
 
 class RunningMoments:
@@ -56,6 +69,7 @@ class FederatedNormalizer:
     :param gamma: discount of the running return whose deviation scales rewards
     :param norm_obs: normalise observations
     :param norm_reward: normalise rewards
+    :param shared: keep the moments of each round's observations apart as well, for the server
     """
 
     CLIP = 10.0
@@ -69,9 +83,12 @@ class FederatedNormalizer:
         gamma: float,
         norm_obs: bool = True,
         norm_reward: bool = True,
+        shared: bool = False,
     ) -> None:
-        self.gamma, self.norm_obs, self.norm_reward = gamma, norm_obs, norm_reward
+        self.gamma, self.norm_obs, self.norm_reward, self.shared = gamma, norm_obs, norm_reward, shared
         self.obs = RunningMoments(n_clients, (obs_dim,))
+        #: of the observations since :meth:`begin_round`
+        self.round_obs = RunningMoments(n_clients, (obs_dim,), epsilon=0.0)
         self.ret = RunningMoments(n_clients, ())
         self.returns = np.zeros((n_clients, n_envs_per_client))
 
@@ -81,6 +98,31 @@ class FederatedNormalizer:
         """
         if self.norm_obs:
             self.obs.update(obs, present)
+            if self.shared:
+                self.round_obs.update(obs, present)
+
+    def begin_round(self, present: np.ndarray) -> None:
+        """Forget the last round's moments of the clients ``present``, ``(n_clients,)`` bool: they were uploaded or are lost."""
+        for moments in (self.round_obs.mean, self.round_obs.count):
+            moments[present] = 0.0
+        self.round_obs.var[present] = 0.0
+
+    def round_moments(self, index: int) -> Payload:
+        """What client ``index`` uploads of its round's observations; nothing where statistics are not shared."""
+        if not self.shared:
+            return {}
+        moments = self.round_obs
+        return {
+            OBSERVATION_COUNT: moments.count[index, 0].copy(),
+            OBSERVATION_MEAN: moments.mean[index].copy(),
+            OBSERVATION_VAR: moments.var[index].copy(),
+        }
+
+    def receive(self, index: int, broadcast: Payload) -> None:
+        """Take the observation statistics of all clients, where ``broadcast`` holds them."""
+        if OBSERVATION_COUNT in broadcast:
+            self.obs.count[index] = broadcast[OBSERVATION_COUNT]
+            self.obs.mean[index], self.obs.var[index] = broadcast[OBSERVATION_MEAN], broadcast[OBSERVATION_VAR]
 
     def normalize_obs(self, obs: np.ndarray, index: int | None = None) -> np.ndarray:
         """Normalised float32 observations.
@@ -121,10 +163,12 @@ class FederatedNormalizer:
 
     def warm_start(self, index: int, mean: np.ndarray, var: np.ndarray, count: int) -> None:
         """Start client ``index``'s observation statistics from its own offline data."""
-        self.obs.mean[index], self.obs.var[index], self.obs.count[index] = mean, var, count
+        for moments in (self.obs, self.round_obs):
+            moments.mean[index], moments.var[index], moments.count[index] = mean, var, count
 
     def _arrays(self) -> dict[str, tuple[object, str]]:
-        named = {f"{kind}.{name}": (getattr(self, kind), name) for kind in ("obs", "ret") for name in ("mean", "var", "count")}
+        kinds = ("obs", "ret", "round_obs") if self.shared else ("obs", "ret")
+        named = {f"{kind}.{name}": (getattr(self, kind), name) for kind in kinds for name in ("mean", "var", "count")}
         return {**named, "returns": (self, "returns")}
 
     def state_dict(self) -> dict[str, th.Tensor]:

@@ -2,40 +2,81 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
 import numpy as np
+from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_fedguide.common.federation import Federation
+from sb3_fedguide.common.screening import Screening, check_screening
 from sb3_fedguide.server.averaging import (
     Aggregator,
     averaged_prefixes,
     averaging_is_due,
     check_aggregator,
     check_averaging,
+    check_server_step,
 )
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload
 
 
 class ParameterAveraging(Federation):
-    """Mixin for methods that average policy parameters; optimiser state and normalisation stay with their client."""
+    """Mixin for methods that average policy parameters; optimiser state stays with its client.
+
+    :param average: ``"all"``, only the ``"actor"`` (with ``log_std``), or only the ``"critic"``
+    :param average_every: average after every so many rounds
+    :param average_until: last round after which to average; ``None`` for no end
+    :param aggregator: ``"mean"``, or coordinate by coordinate the ``"median"`` or a ``"trimmed_mean"``, which a minority of
+        wrong uploads cannot move far; both ignore numbers of samples
+    :param trim_fraction: share of the clients that ``"trimmed_mean"`` leaves out at either end
+    :param server_step: how far the server goes along the clients' mean update: a number (1: the average itself), or ``"exp"``
+        for FedExP's, see :func:`~sb3_fedguide.server.averaging.fedexp_step`
+    :param server_momentum: share of the server's last update that is added to the next one
+    :param mix: share of what the server sends that a client takes into its own parameters: a number, or a schedule of the
+        remaining progress, from 1 to 0, that leaves everybody with a policy of its own at the end. Above 1 it is 1: ``lin_2``
+        in a configuration takes all for half of the run, and falls to nothing over the other half
+    :param screening: share of its environment steps that a client may spend on tests of what the server sends against its own
+        policy, see :class:`~sb3_fedguide.common.screening.Screening`; with 0 it takes it untested
+    """
+
+    state_attributes: ClassVar[tuple[str, ...]] = ("screening_state",)
 
     def _init_averaging(
         self,
-        average: Literal["all", "actor", "critic"],
-        average_every: int,
-        average_until: int | None,
-        aggregator: Aggregator,
-        trim_fraction: float,
+        average: Literal["all", "actor", "critic"] = "all",
+        average_every: int = 1,
+        average_until: int | None = None,
+        aggregator: Aggregator = "mean",
+        trim_fraction: float = 0.25,
+        server_step: float | Literal["exp"] = 1.0,
+        server_momentum: float = 0.0,
+        mix: float | Schedule = 1.0,
+        screening: float = 0.0,
     ) -> None:
-        """Called by a subclass's constructor, before its base's."""
+        """Called by a subclass's constructor, before its base's.
+
+        :raises ValueError: for values out of range
+        """
         check_averaging(average, average_every)
         check_aggregator(aggregator, trim_fraction)
-        self.aggregator = aggregator
-        self.trim_fraction = trim_fraction
+        check_server_step(server_step, server_momentum)
+        check_screening(screening, average)
+        if not callable(mix) and not 0 <= mix <= 1:
+            raise ValueError(f"mix={mix} must lie in [0, 1]: it is the share of what the server sends that a client takes")
         self.average: Literal["all", "actor", "critic"] = average
         self.average_every = average_every
         self.average_until = average_until
+        self.aggregator = aggregator
+        self.trim_fraction = trim_fraction
+        self.server_step = server_step
+        self.server_momentum = server_momentum
+        self.mix = mix
+        self.screening = screening
+        #: see :attr:`Screening.state`; empty until the first test or without tests
+        self.screening_state: dict[str, np.ndarray] = {}
+        self._tests = Screening(self)
+        self._shares: dict[int, float] = {}
 
     @property
     def averaged_prefixes(self) -> tuple[str, ...]:
@@ -46,18 +87,69 @@ class ParameterAveraging(Federation):
         return self.average != "critic" and averaging_is_due(round, self.average_every, self.average_until)
 
     def upload(self, index: int) -> Payload:
-        return policy_upload(self, index, self.averaged_prefixes)
+        payload = super().upload(index)
+        if not averaging_is_due(self.round, self.average_every, self.average_until):
+            return payload
+        if self._tests.is_alone(index):
+            return {**payload, N_SAMPLES: np.array(0, dtype=np.float32)}
+        return {**payload, **self._policy_upload(index)}
+
+    def upload_shapes(self) -> dict[str, list[int]]:
+        policy = {name: list(array.shape) for name, array in self._policy_upload(0).items()}
+        return {**super().upload_shapes(), **policy}
+
+    def _policy_upload(self, index: int) -> Payload:
+        """Copies of a client's averaged parameters under SB3's names, and the number of samples behind them."""
+        payload = self._parameters(index)
+        payload[N_SAMPLES] = np.array(self.rollout_size, dtype=np.float32)
+        return payload
+
+    def _parameters(self, index: int) -> Payload:
+        named = self.policy.named_parameters()
+        return {
+            name: parameter[index].detach().cpu().numpy().copy()
+            for name, parameter in named
+            if name.startswith(self.averaged_prefixes)
+        }
+
+    def complete_state(self) -> None:
+        super().complete_state()
+        if self.screening:
+            self._tests.begin()
+
+    def take_broadcasts(self, broadcasts: Mapping[int, Payload]) -> None:
+        mix = min(1.0, self.mix(self._current_progress_remaining)) if callable(self.mix) else self.mix
+        # who has nothing of its own, or nothing to do with what the others have, takes all or nothing
+        self._shares = {
+            index: 1.0 if self._tests.is_alone(index) or not self.has_trained[index] else mix for index in broadcasts
+        }
+        super().take_broadcasts(broadcasts)
+
+    def _accepted(self, broadcasts: Mapping[int, Payload]) -> Mapping[int, Payload]:
+        """What is left of the broadcasts after the clients' tests."""
+        if not self.screening:
+            return broadcasts
+        averages = {index: self._of_policy(broadcast) for index, broadcast in broadcasts.items()}
+        refused = self._tests.refused({index: self.mixed(index, average) for index, average in averages.items() if average})
+        return {
+            index: {name: array for name, array in broadcast.items() if index not in refused or name not in averages[index]}
+            for index, broadcast in broadcasts.items()
+        }
 
     def receive(self, index: int, broadcast: Payload) -> None:
-        self.policy.load_client(index, broadcast)
+        super().receive(index, broadcast)
+        self.policy.load_client(index, self.mixed(index, self._of_policy(broadcast)))
 
+    def _of_policy(self, broadcast: Payload) -> Payload:
+        return {name: array for name, array in broadcast.items() if name.startswith(self.averaged_prefixes)}
 
-def policy_upload(model: Federation, index: int, prefixes: tuple[str, ...]) -> Payload:
-    """Copies of a client's parameters under SB3's names, and the number of samples behind them."""
-    payload: Payload = {
-        name: parameter[index].detach().cpu().numpy().copy()
-        for name, parameter in model.policy.named_parameters()
-        if name.startswith(prefixes)
-    }
-    payload[N_SAMPLES] = np.array(model.rollout_size, dtype=np.float32)
-    return payload
+    def mixed(self, index: int, average: Payload) -> Payload:
+        """What becomes of the parameters of the client at position ``index`` where it takes its share of ``average``."""
+        share = self._shares.get(index, 1.0)
+        if share == 1 or not average:
+            return average
+        own = self._parameters(index)
+        return {name: ((1 - share) * own[name] + share * array).astype(np.float32) for name, array in average.items()}
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_tests", "_shares"]

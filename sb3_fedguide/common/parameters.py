@@ -14,7 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fed_envs.files import atomic_file
 from sb3_fedguide.common.array_files import array_mismatches, read_arrays, write_arrays
-from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.stacked import to_arrays, to_tensors
 
 FORMAT, VERSION = "sb3_fedguide parameters", 1
@@ -26,7 +26,7 @@ class ParameterFiles(BaseAlgorithm):
 
     policy: Any
     normalizer: FederatedNormalizer
-    normalize: bool
+    normalize: Normalize
     pretrained: bool
     client_ids: list[int]
 
@@ -79,12 +79,26 @@ class ParameterFiles(BaseAlgorithm):
         if parts:
             raise ValueError(f"the file holds {', '.join(sorted(parts))}, which this method has not")
 
+    def acting_arrays(self) -> dict[str, np.ndarray]:
+        """Copies of what decides how all clients act and the exchange may change: the policies under their parameters' names,
+        and shared observation statistics under ``normalizer/``."""
+        statistics = to_arrays(self.normalizer.state_dict(), "normalizer/") if self.normalizer.shared else {}
+        shared = {name: array for name, array in statistics.items() if name.startswith("normalizer/obs.")}
+        return {**to_arrays(self.policy.state_dict()), **shared}
+
+    def set_acting_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        """Take some or all of the arrays named as in :meth:`acting_arrays`, which fit."""
+        policy = {name: array for name, array in arrays.items() if not name.startswith("normalizer/")}
+        self.policy.load_state_dict({**self.policy.state_dict(), **to_tensors(policy)})
+        self.normalizer.load_state_dict(to_tensors(take_prefix(arrays, "normalizer/")), strict=False)
+
     def parameter_arrays(self) -> dict[str, np.ndarray]:
         """Copies of everything learned, by name."""
         policy = to_arrays(self.policy.state_dict(), "policy/")
         statistics = to_arrays(self.normalizer.state_dict(), "normalizer/")
-        del statistics["normalizer/returns"]  # of unfinished episodes
-        return {**policy, **statistics}
+        of_one_round = ("normalizer/returns", "normalizer/round_obs.")
+        kept = {name: array for name, array in statistics.items() if not name.startswith(of_one_round)}
+        return {**policy, **kept}
 
     def set_parameter_arrays(self, arrays: dict[str, np.ndarray]) -> None:
         """Take arrays named as in :meth:`parameter_arrays`, which fit."""

@@ -30,3 +30,4 @@ class Role(IntEnum):
     SERVER = 11
     PARTICIPATION = 12
     DELAY = 13
+    SCREENING = 14

@@ -185,7 +185,7 @@ class Site:
             self._learn()
             return {}, {}
         evaluations = self._receive(message)
-        return self.model.upload(0), {"evaluations": evaluations}
+        return self.model.outgoing(0), {"evaluations": evaluations}
 
     def _play_round(self, message: Message) -> Answer:
         callbacks, hooks = self._learn()
@@ -197,7 +197,7 @@ class Site:
             model.play_round(callbacks, hooks, log_interval=1)
         if self._evaluation is not None and self._evaluation.is_due(message.round):
             evaluations.append(self._evaluated("deployed", message.round))
-        return model.upload(0), {
+        return model.outgoing(0), {
             "figures": self._log.figures if self._report else {},
             "evaluations": evaluations,
         }
@@ -213,7 +213,7 @@ class Site:
         if not message.payload or number == self.n_received:
             return []
         self._learn()
-        self.model.receive(0, message.payload)
+        self.model.take_broadcasts({0: message.payload})
         self.n_received = number
         due = self._evaluation is not None and (after % self._evaluation.eval_freq == 0 or after == self.n_rounds)
         return [self._evaluated("broadcast", after)] if due and after > 0 and self.model.sends_policy(after) else []

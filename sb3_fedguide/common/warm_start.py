@@ -11,7 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
-from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
 from sb3_fedguide.server.payload import Payload
@@ -32,7 +32,7 @@ class WarmStart(BaseAlgorithm):
     cache_dir: str | Path | None
     gamma: float
     bc_weight: float
-    normalize: bool
+    normalize: Normalize
     normalizer: FederatedNormalizer
     pretrained: bool
 
@@ -83,7 +83,7 @@ class WarmStart(BaseAlgorithm):
             for index, data in enumerate(stage.datasets()):
                 obs = data.observations.astype(np.float64)
                 self.normalizer.warm_start(index, obs.mean(axis=0), obs.var(axis=0), len(obs))
-        cloned = stage.behavior_cloning(self._actors(), normalize=self.normalize)
+        cloned = stage.behavior_cloning(self._actors(), normalize=bool(self.normalize))
         with th.no_grad():
             for name, tensor in cloned.items():
                 self.policy.actor_parameter(name).lerp_(tensor.to(self.device), self.bc_weight)

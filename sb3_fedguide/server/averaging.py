@@ -1,7 +1,8 @@
-"""Federated averaging of parameters (McMahan et al. 2017)."""
+"""Federated averaging of parameters (McMahan et al. 2017), and how far the server goes towards the average."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Literal, get_args
 
@@ -41,13 +42,38 @@ def combine(
     """
     if aggregator == "mean":
         return weighted_average(uploads, names)
-    combined = {}
-    for name in names:
-        ordered = np.sort(np.stack([uploads[client][name] for client in sorted(uploads)]).astype(np.float64), axis=0)
-        n = len(ordered)
-        cut = (n - 1) // 2 if aggregator == "median" else min(int(trim_fraction * n + 1e-9), (n - 1) // 2)
-        combined[name] = ordered[cut : n - cut].mean(axis=0).astype(np.float32)
-    return combined
+    stacks = {name: np.stack([uploads[client][name] for client in sorted(uploads)]) for name in names}
+    return {name: robust_mean(stack, aggregator, trim_fraction).astype(np.float32) for name, stack in stacks.items()}
+
+
+def robust_mean(values: np.ndarray, aggregator: Aggregator, trim_fraction: float) -> np.ndarray:
+    """Median or trimmed mean over the first axis, see :func:`combine`; float64."""
+    ordered = np.sort(values.astype(np.float64), axis=0)
+    n = len(ordered)
+    cut = (n - 1) // 2 if aggregator == "median" else min(int(trim_fraction * n + 1e-9), (n - 1) // 2)
+    return ordered[cut : n - cut].mean(axis=0)
+
+
+def fedexp_step(latest: Payload, uploads: Mapping[int, Payload], change: Payload, epsilon: float = 1e-12) -> float:
+    """FedExP's step: ``max(1, sum_i w_i |Delta_i|^2 / (2 (|Delta|^2 + epsilon)))`` (Jhunjhunwala et al. 2023, Eq. 9).
+
+    Clients whose updates are orthogonal get a long step, those that agree a step of one.
+
+    :param latest: theta, from which ``Delta_i = theta_i - theta``
+    :param uploads: theta_i by client, with the samples whose share is ``w_i`` (``1 / N`` in the paper)
+    :param change: Delta, what takes the place of the average of the ``Delta_i``
+    """
+    counts = {client: float(payload[N_SAMPLES]) for client, payload in uploads.items()}
+    total = sum(counts.values())
+    lengths = sum(
+        counts[client] / total * _squared_norm({name: uploads[client][name] - latest[name].astype(np.float64) for name in change})
+        for client in sorted(uploads)
+    )
+    return max(1.0, lengths / (2 * (_squared_norm(change) + epsilon)))
+
+
+def _squared_norm(arrays: Payload) -> float:
+    return float(sum(np.sum(np.square(array, dtype=np.float64)) for array in arrays.values()))
 
 
 def averaging_is_due(round: int, every: int, until: int | None = None) -> bool:
@@ -82,17 +108,31 @@ def check_aggregator(aggregator: str, trim_fraction: float) -> None:
         raise ValueError(f"trim_fraction={trim_fraction} must lie in [0, 0.5): so much is left out on either side")
 
 
+def check_server_step(server_step: float | str, server_momentum: float) -> None:
+    """:raises ValueError: for a step that is neither positive nor ``"exp"``, or a momentum outside [0, 1)"""
+    if server_step != "exp" and (isinstance(server_step, str) or not 0 < server_step < math.inf):
+        raise ValueError(f"server_step={server_step!r} must be a positive number, or 'exp' for FedExP's; 1 is the average itself")
+    if not 0 <= server_momentum < 1:
+        raise ValueError(f"server_momentum={server_momentum} must lie in [0, 1): it is what is kept of the last update")
+
+
 class Averaging(Strategy):
     """Averages every uploaded array whose name begins with one of ``prefixes`` and sends the average to all.
 
-    Between the rounds in which it averages it sends nothing, and clients go on with their own parameters.
+    What it sends is ``theta + server_step * v`` with ``v = server_momentum * v + (average - theta)``, where theta is what it
+    sent last (FedOpt's SGD, Reddi et al. 2021). A step of 1 without momentum is the average itself.
+
+    Between the rounds in which it averages it sends nothing, and clients go on with their own parameters. An upload with zero
+    samples is of a client that tests the average and has not taken it: it counts for nothing.
 
     :param prefixes: what to average; everything by default
     :param average_every: after rounds ``average_every``, ``2 * average_every``, ...
     :param average_until: not after later rounds than this; ``None`` for no end
     :param aggregator: what takes the place of the average, see :func:`combine`
     :param trim_fraction: what ``"trimmed_mean"`` leaves out on either side
-    :raises ValueError: for an unknown aggregator, or a fraction that leaves nothing
+    :param server_step: how far to go along the mean update: a number, or ``"exp"`` for :func:`fedexp_step`
+    :param server_momentum: share of the last update that is added to this one
+    :raises ValueError: for values out of range
     """
 
     def __init__(
@@ -102,15 +142,21 @@ class Averaging(Strategy):
         average_until: int | None = None,
         aggregator: Aggregator = "mean",
         trim_fraction: float = 0.25,
+        server_step: float | Literal["exp"] = 1.0,
+        server_momentum: float = 0.0,
     ) -> None:
         super().__init__()
         check_aggregator(aggregator, trim_fraction)
+        check_server_step(server_step, server_momentum)
         self.prefixes = prefixes
         self.average_every = average_every
         self.average_until = average_until
         self.aggregator = aggregator
         self.trim_fraction = trim_fraction
+        self.server_step = server_step
+        self.server_momentum = server_momentum
         self._latest: Payload = {}
+        self._velocity: Payload = {}
 
     def is_due(self, round: int) -> bool:
         """Whether the parameters are averaged after round ``round``."""
@@ -121,18 +167,32 @@ class Averaging(Strategy):
 
     def aggregate(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:
         self.metrics = {}
-        first = next(iter(uploads.values()))
-        names = [name for name in first if name != N_SAMPLES and name.startswith(self.prefixes)]
+        taking_part = {client: payload for client, payload in uploads.items() if payload.get(N_SAMPLES, 1) > 0}
+        names = [
+            name
+            for name in next(iter(taking_part.values()), {})
+            if name != N_SAMPLES and name.startswith(self.prefixes)
+        ]
         if not self.is_due(round) or not names:
             return {client: {} for client in uploads}
-        average = self._combine(uploads, names)
+        average = self._combine(taking_part, names)
         drifts = [
             np.sqrt(sum(float(np.sum((payload[name] - average[name]) ** 2, dtype=np.float64)) for name in names))
-            for payload in uploads.values()
+            for payload in taking_part.values()
         ]
         self.metrics = {"drift": float(np.mean(drifts))}
-        self._latest = average
-        return {client: {name: array.copy() for name, array in average.items()} for client in uploads}
+        self._latest = self._step_towards(average, taking_part)
+        return {client: self.latest(client) for client in uploads}
+
+    def _step_towards(self, average: Payload, uploads: Mapping[int, Payload]) -> Payload:
+        """theta + server_step * v; the average itself in the first round, where no theta is known."""
+        if (self.server_step == 1 and self.server_momentum == 0) or not self._latest:
+            return average
+        change = {name: average[name].astype(np.float64) - self._latest[name] for name in average}
+        step = fedexp_step(self._latest, uploads, change) if self.server_step == "exp" else self.server_step
+        self._velocity = {name: self.server_momentum * self._velocity.get(name, 0.0) + change[name] for name in change}
+        self.metrics["server_step"] = float(step)
+        return {name: (self._latest[name] + step * self._velocity[name]).astype(np.float32) for name in change}
 
     def latest(self, client: int) -> Payload:
         return {name: array.copy() for name, array in self._latest.items()}

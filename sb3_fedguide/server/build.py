@@ -9,6 +9,7 @@ from typing import Any
 from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.common.seeding import Role, seed_sequence
 from sb3_fedguide.server.averaging import Averaging, averaged_prefixes, check_averaging
+from sb3_fedguide.server.moments import ObservationMoments
 from sb3_fedguide.server.ot_moe import OTMoE
 from sb3_fedguide.server.participants import check_fraction
 from sb3_fedguide.server.payload import DDPG_ACTOR, DDPG_CRITIC, PPO_ACTOR, PPO_CRITIC
@@ -21,7 +22,7 @@ Settings = Mapping[str, Any]
 Maker = Callable[[Settings, int, int], Strategy | None]
 
 #: What every server has to know; the defaults are those of the constructors of all federations.
-COMMON: dict[str, Any] = {"client_fraction": 1.0, "upload_bound": UPLOAD_BOUND}
+COMMON: dict[str, Any] = {"client_fraction": 1.0, "upload_bound": UPLOAD_BOUND, "normalize": False}
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,9 @@ class Method:
 
 def _averaging(kind: type[Averaging], actor: tuple[str, ...], critic: tuple[str, ...]) -> Maker:
     def make(settings: Settings, n_clients: int, seed: int) -> Strategy:
-        average, every, until = settings["average"], settings["average_every"], settings["average_until"]
-        check_averaging(average, every)
-        prefixes = averaged_prefixes(average, actor, critic)
-        return kind(prefixes, every, until, settings["aggregator"], settings["trim_fraction"])
+        check_averaging(settings["average"], settings["average_every"])
+        prefixes = averaged_prefixes(settings["average"], actor, critic)
+        return kind(prefixes, **{name: settings[name] for name in _OF_AVERAGING})
 
     return make
 
@@ -53,12 +53,15 @@ def _experts(settings: Settings, n_clients: int, seed: int) -> Strategy:
 
 def _experts_and_actors(settings: Settings, n_clients: int, seed: int) -> Strategy:
     check_averaging("actor", settings["average_every"])
-    return Composite([_experts(settings, n_clients, seed), Averaging(PPO_ACTOR, settings["average_every"])])
+    averaging = Averaging(PPO_ACTOR, **{name: settings[name] for name in _OF_AVERAGING})
+    return Composite([_experts(settings, n_clients, seed), averaging])
 
 
-_AVERAGING = {
-    "average": "all", "average_every": 1, "average_until": None, "aggregator": "mean", "trim_fraction": 0.25,
+_OF_AVERAGING = {
+    "average_every": 1, "average_until": None, "aggregator": "mean", "trim_fraction": 0.25, "server_step": 1.0,
+    "server_momentum": 0.0,
 }  # fmt: skip
+_AVERAGING = {"average": "all", **_OF_AVERAGING}
 _EXPERTS = {"n_experts": None, "eta": 0.05, "cost": "score", "cost_scaling": "max"}
 _PPO_AVERAGING = Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), _AVERAGING)
 
@@ -72,7 +75,8 @@ METHODS: dict[str, Method] = {
     "fedrl": Method(_averaging(Averaging, DDPG_ACTOR, DDPG_CRITIC), _AVERAGING),
     "fedguide": Method(_experts, _EXPERTS),
     "fedguide-p": Method(_experts, _EXPERTS),
-    "fedguide-a": Method(_experts_and_actors, {**_EXPERTS, "average_every": 5}),
+    "fedguide-r": Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), {**_AVERAGING, "server_step": 2.0}),
+    "fedguide-a": Method(_experts_and_actors, {**_EXPERTS, **_OF_AVERAGING, "average_every": 5}),
 }
 
 
@@ -97,10 +101,10 @@ def find_method(name: str) -> Method:
         return METHODS[name]
     if name not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {name!r}; known are {', '.join(ALGORITHMS)}")
-    from sb3_fedguide.common.federation import Federation
+    from sb3_fedguide.common.exchange import Exchange
 
     cls = algorithm(name)
-    if cls._make_strategy is not Federation._make_strategy:
+    if cls._make_strategy is not Exchange._make_strategy:
         raise ValueError(
             f"{cls.__name__} makes its strategy itself, which needs the model; give its server's side to "
             "sb3_fedguide.server.build.register_method() and its name to the class's server_method"
@@ -116,7 +120,9 @@ def complete_settings(algorithm: str, given: Settings) -> dict[str, Any]:
     settings = {**COMMON, **find_method(algorithm).defaults}
     if unknown := sorted(given.keys() - settings.keys()):
         raise ValueError(f"the server of {algorithm} has no setting {unknown[0]!r}; it has {', '.join(sorted(settings))}")
-    return {**settings, **given}
+    complete = {**settings, **given}
+    complete["normalize"] = "shared" if complete["normalize"] == "shared" else False  # what stays with clients is no matter
+    return complete
 
 
 def make_strategy(algorithm: str, settings: Settings, n_clients: int, seed: int) -> Strategy | None:
@@ -132,6 +138,9 @@ def make_strategy(algorithm: str, settings: Settings, n_clients: int, seed: int)
     check_fraction(complete["client_fraction"])
     check_bound(complete["upload_bound"])
     strategy = find_method(algorithm).make(complete, n_clients, seed)
+    if complete["normalize"] == "shared":
+        moments = ObservationMoments(complete.get("aggregator", "mean"), complete.get("trim_fraction", 0.25))
+        strategy = moments if strategy is None else Composite([strategy, moments])
     if strategy is not None:
         strategy.upload_bound = complete["upload_bound"]
     return strategy

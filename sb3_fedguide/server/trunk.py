@@ -10,6 +10,7 @@ import numpy as np
 
 from fed_envs.faults import ClientError
 from fed_envs.plain_data import State, freeze, thaw
+from sb3_fedguide.server.moments import Moments, merge
 from sb3_fedguide.server.payload import N_SAMPLES, Payload
 from sb3_fedguide.server.validation import check_uploads
 
@@ -25,19 +26,10 @@ _MOST_UPDATES = 100
 
 
 def merge_moments(uploads: Sequence[Mapping[str, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of the union of the clients' data, from their moments alone (Chan et al. 1979)."""
-    if not uploads:
-        raise ValueError("merge_moments needs the moments of at least one client.")
-    count = float(uploads[0]["n_samples"])
-    mean, squares = uploads[0]["mean"], uploads[0]["var"] * count
-    for upload in uploads[1:]:
-        n = float(upload["n_samples"])
-        total = count + n
-        delta = upload["mean"] - mean
-        squares = squares + upload["var"] * n + delta**2 * (count * n / total)
-        mean = mean + delta * (n / total)
-        count = total
-    return mean, np.sqrt(squares / count)
+    """Mean and standard deviation of the union of the clients' data, see :func:`~sb3_fedguide.server.moments.merge`."""
+    parts = [Moments(float(upload[N_SAMPLES]), upload["mean"], upload["var"]) for upload in uploads]
+    _, mean, var = merge(parts)
+    return mean, np.sqrt(var)
 
 
 def average_uploads(uploads: Sequence[Mapping[str, np.ndarray]], n_samples: Sequence[int]) -> Payload:

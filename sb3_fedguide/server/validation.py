@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sb3_fedguide.server.payload import N_SAMPLES, Payload
+from sb3_fedguide.server.payload import N_SAMPLES, OBSERVATION_COUNT, OBSERVATION_VAR, OBSERVATIONS, Payload
 
 #: An upload's arrays as names with shapes, in the order of names.
 Form = tuple[tuple[str, tuple[int, ...]], ...]
@@ -30,9 +30,9 @@ def check_uploads(
 
     In this order an upload has to
 
-    * be named arrays of float32, with a positive number of samples where there is one;
+    * be named arrays of float32 (moments of observations: float64), with a positive number of samples where there is one;
     * be finite;
-    * have the names and shapes that most of the finite uploads have;
+    * have the names and shapes that most of the finite uploads have; with zero samples, some of them and no parameters;
     * have norms of at most ``median + bound * max(MAD, median / 2)`` of the positive norms of what is still left, from three
       uploads on. MAD is their median absolute deviation. It is never above the median, so that ``bound`` allows between
       ``1 + bound / 2`` and ``1 + bound`` times the median.
@@ -49,12 +49,15 @@ def check_uploads(
     :param bound: see above
     :return: the reason by client for every upload that is to be rejected
     """
-    reasons = {client: reason for client in sorted(uploads) if (reason := broken(uploads[client]))}
+    reasons = {client: reason for client in sorted(uploads) if (reason := broken(uploads[client], groups))}
     forms = {client: form(uploads[client]) for client in sorted(uploads) if client not in reasons}
     if not forms:
         return reasons
-    usual = Counter(forms.values()).most_common(1)[0][0]
-    reasons |= {client: _difference(own, usual) for client, own in forms.items() if own != usual}
+    idle = {client for client in forms if is_idle(uploads[client])}
+    usual = Counter(own for client, own in forms.items() if client not in idle or idle == forms.keys()).most_common(1)[0][0]
+    for client, own in forms.items():
+        if own != usual and not (client in idle and set(own) <= set(usual)):
+            reasons[client] = _difference(own, usual)
     left = [client for client in forms if client not in reasons]
     if len(left) >= FEWEST_NORMS:
         apart, shapes = (*groups, N_SAMPLES), dict(usual)
@@ -63,7 +66,8 @@ def check_uploads(
             for client in left
         }
         new = [name for name, _ in usual if not name.startswith(apart) and any(name not in own for own in known.values())]
-        medians = {name: np.median(np.stack([uploads[client][name] for client in left]), axis=0) for name in new}
+        holders = [client for client in left if client not in idle]
+        medians = {name: np.median(np.stack([uploads[client][name] for client in holders]), axis=0) for name in new if holders}
         norms = {client: group_norms(uploads[client], {**medians, **known[client]}, apart) for client in left}
         reasons |= _outliers(norms, bound)
     return reasons
@@ -83,10 +87,10 @@ def group_norms(upload: Payload, reference: Payload, groups: tuple[str, ...]) ->
 
 def _outliers(norms: Mapping[int, Mapping[str, float]], bound: float) -> dict[int, str]:
     reasons: dict[int, str] = {}
-    for group in next(iter(norms.values())):
-        limit = norm_limit([own[group] for own in norms.values()], bound)
+    for group in dict.fromkeys(group for own in norms.values() for group in own):
+        limit = norm_limit([own[group] for own in norms.values() if group in own], bound)
         for client, own in norms.items():
-            if own[group] > limit:
+            if own.get(group, 0.0) > limit:
                 label = group.rstrip(".")
                 reasons.setdefault(client, f"the norm of its {label} is {own[group]:.3g}, over the limit of {limit:.3g}")
     return reasons
@@ -102,7 +106,12 @@ def norm_limit(norms: list[float], bound: float) -> float:
     return median + bound * max(float(np.median(np.abs(positive - median))), median / 2)
 
 
-def broken(upload: Payload) -> str | None:
+def is_idle(upload: Payload) -> bool:
+    """Whether an upload says that there is nothing of its client to average: it holds zero samples."""
+    return N_SAMPLES in upload and not np.any(upload[N_SAMPLES])
+
+
+def broken(upload: Payload, groups: tuple[str, ...] = ()) -> str | None:
     """What is wrong with an upload by itself, if anything."""
     if not isinstance(upload, Mapping):
         return f"it is a {type(upload).__name__}, not named arrays"
@@ -111,12 +120,17 @@ def broken(upload: Payload) -> str | None:
             return f"the name {name!r} is not a string"
         if not isinstance(array, np.ndarray | np.generic):
             return f"{name} is a {type(array).__name__}, not an array"
-        if array.dtype != np.float32:
-            return f"{name} has the type {array.dtype}, not float32"
+        kind = np.float64 if name.startswith(OBSERVATIONS) else np.float32
+        if array.dtype != kind:
+            return f"{name} has the type {array.dtype}, not {kind.__name__}"
         if not np.isfinite(array).all():
             return f"{name} has values that are not finite"
-    if N_SAMPLES in upload and not (np.ndim(upload[N_SAMPLES]) == 0 and upload[N_SAMPLES] > 0):
-        return f"{N_SAMPLES} is not a positive number"
+        if name in (OBSERVATION_COUNT, OBSERVATION_VAR) and (array < 0).any():
+            return f"{name} is negative"
+    if N_SAMPLES in upload:
+        may_be_idle = all(name.startswith((N_SAMPLES, *groups)) for name in upload)
+        if np.ndim(upload[N_SAMPLES]) or not (upload[N_SAMPLES] > 0 or (may_be_idle and upload[N_SAMPLES] == 0)):
+            return f"{N_SAMPLES} is not a positive number"
     return None
 
 

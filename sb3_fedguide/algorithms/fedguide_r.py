@@ -1,0 +1,59 @@
+"""FedGuide-R: what measured best here, and falls back to every client's own where sharing hurts."""
+
+from __future__ import annotations
+
+from typing import Literal, Unpack
+
+from stable_baselines3.common.type_aliases import Schedule
+
+from sb3_fedguide.algorithms.fedavg import FedAvg
+from sb3_fedguide.common.arguments import FederatedPPOArguments
+from sb3_fedguide.common.federation import FederationLike, PolicyLike
+from sb3_fedguide.server.averaging import Aggregator
+
+
+class FedGuideR(FedAvg):
+    """FedAvg that routes every client by its own returns: to what all share while that pays, then to a policy of its own.
+
+    Four parts, each an option of :class:`FedAvg` and here switched on: observation statistics of all clients
+    (``normalize="shared"`` in the settings of ``zoo_configs``); a server that goes twice as far as the average
+    (``server_step``); a share of it that a client takes, which falls to zero over the run (``mix``); and tests in the client's
+    own environments, after which it leaves what the others share, or comes back (``screening``).
+
+    It is not of the FedGuide paper, and has neither its priors nor its DICE values: they did not pay (``docs/results.md``).
+    What it keeps is the paper's idea that the server's knowledge guides a client only as far as it fits.
+
+    Parameters are those of :class:`FedAvg`, with other defaults.
+    """
+
+    server_method = "fedguide-r"
+
+    def __init__(
+        self,
+        policy: PolicyLike,
+        env: FederationLike | None,
+        average: Literal["all", "actor", "critic"] = "all",
+        average_every: int = 1,
+        average_until: int | None = None,
+        aggregator: Aggregator = "mean",
+        trim_fraction: float = 0.25,
+        server_step: float | Literal["exp"] = 2.0,
+        server_momentum: float = 0.0,
+        mix: float | Schedule = 1.0,
+        screening: float = 0.05,
+        **ppo: Unpack[FederatedPPOArguments],
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            average=average,
+            average_every=average_every,
+            average_until=average_until,
+            aggregator=aggregator,
+            trim_fraction=trim_fraction,
+            server_step=server_step,
+            server_momentum=server_momentum,
+            mix=mix,
+            screening=screening,
+            **ppo,
+        )

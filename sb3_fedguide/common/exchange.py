@@ -1,0 +1,80 @@
+"""What a federation's clients send to the server and take from it, and the server's side that belongs to the method."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.server.build import COMMON, complete_settings, find_method, make_strategy
+from sb3_fedguide.server.payload import OBSERVATIONS
+from sb3_fedguide.server.strategy import Payload, Strategy
+
+
+class Exchange(BaseAlgorithm):
+    """Mixin of a federation. A method defines :meth:`upload` and :meth:`receive`; whatever carries payloads calls
+    :meth:`outgoing` and :meth:`take_broadcasts`, which add what every method has.
+    """
+
+    #: name of the server's side in :data:`sb3_fedguide.server.build.METHODS`
+    server_method: ClassVar[str] = "local"
+    strategy: Strategy | None
+    upload_bound: float | None
+    normalizer: FederatedNormalizer
+    n_clients: int
+
+    def sends_policy(self, round: int) -> bool:
+        """Whether the exchange after round ``round`` replaces the clients' policies; what it sent is evaluated as well."""
+        return False
+
+    def _start_server(self) -> None:
+        """Make the server's side, unless it came with a saved model."""
+        if self.strategy is None:
+            self.strategy = self._make_strategy()
+            if self.strategy is not None:
+                self.strategy.upload_bound = self.upload_bound
+
+    def _make_strategy(self) -> Strategy | None:
+        """The server's side of this method; ``None`` where nothing is exchanged."""
+        assert self.seed is not None
+        return make_strategy(self.server_method, self.server_settings(), self.n_clients, self.seed)
+
+    def server_settings(self) -> dict[str, Any]:
+        """What the server of this method has to know, by the names of the constructor's parameters."""
+        own = {name: getattr(self, name) for name in (*COMMON, *find_method(self.server_method).defaults)}
+        return complete_settings(self.server_method, own)
+
+    def upload(self, index: int) -> Payload:
+        """What the client at position ``index`` sends of its method: float32 arrays and nothing else."""
+        return {}
+
+    def receive(self, index: int, broadcast: Payload) -> None:
+        """Take what the server sent of this method to the client at position ``index``."""
+
+    def upload_shapes(self) -> dict[str, list[int]]:
+        """Shapes of what a client uploads by name, known before the offline stage; what only comes later is left out."""
+        return {name: list(array.shape) for name, array in self.upload(0).items()}
+
+    def outgoing(self, index: int) -> Payload:
+        """All that the client at position ``index`` sends: :meth:`upload`, and its round's moments where they are shared."""
+        return {**self.upload(index), **self.normalizer.round_moments(index)}
+
+    def take_broadcasts(self, broadcasts: Mapping[int, Payload]) -> None:
+        """Take all that the server sent.
+
+        :param broadcasts: by the client's position
+        """
+        for index, broadcast in broadcasts.items():
+            self.normalizer.receive(index, broadcast)
+        of_method = {
+            index: {name: array for name, array in broadcast.items() if not name.startswith(OBSERVATIONS)}
+            for index, broadcast in broadcasts.items()
+        }
+        for index, broadcast in self._accepted(of_method).items():
+            self.receive(index, broadcast)
+
+    def _accepted(self, broadcasts: Mapping[int, Payload]) -> Mapping[int, Payload]:
+        """What the clients take of what they were sent, by position."""
+        return broadcasts

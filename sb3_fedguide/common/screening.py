@@ -1,0 +1,143 @@
+"""Tests of what the server sends in the client's own environments: who takes it, and who goes on alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sb3_fedguide.common.evaluation import evaluate_federation, evaluation_env
+from sb3_fedguide.common.seeding import Role, stream
+from sb3_fedguide.server.strategy import Payload
+
+if TYPE_CHECKING:
+    from fed_envs import FederatedVecEnv
+    from sb3_fedguide.common.parameter_averaging import ParameterAveraging
+
+#: Episodes of either policy in a test, where there are steps for so many.
+EPISODES = 5
+#: How much worse a policy has to test to be left, and how much better to be taken again, in what the client's returns measure.
+LEAVE, RETURN = 0.3, 0.1
+#: The first test comes after this round; between two tests lie at most so many.
+FIRST_ROUND, LONGEST_WAIT = 2, 16
+#: Part of the steps that are left for tests which one test may take.
+PART = 0.25
+
+
+class Screening:
+    """Each client's tests, and what it concludes from them.
+
+    A client takes what the server sends until that tests clearly worse than the policy that the client has just trained. Then
+    it goes on alone: it uploads nothing that counts, and what the server sends is left to the others, until it tests clearly
+    better than the client's own. A test is some episodes of both policies, deterministic and with the same seeds, in copies
+    of the client's environments. A test that changes nothing doubles the rounds until the next one.
+
+    Their steps are environment steps: ``Federation.test_steps`` counts them.
+
+    The idea is that of POET's transfer (Wang et al. 2019) and of screening in CAESAR (Mak et al. 2024).
+    """
+
+    def __init__(self, model: ParameterAveraging) -> None:
+        self.model = model
+        self._env: FederatedVecEnv | None = None
+
+    def begin(self) -> dict[str, np.ndarray]:
+        """Per client, ``(n_clients,)``: whether it is alone, the steps of its tests, the round of its next one, and the
+        rounds that it then waits."""
+        state, n_clients = self.model.screening_state, self.model.n_clients
+        if not state:
+            state["alone"] = np.zeros(n_clients, dtype=bool)
+            state["steps"] = np.zeros(n_clients, dtype=int)
+            state["next_round"] = np.full(n_clients, FIRST_ROUND)
+            state["wait"] = np.ones(n_clients, dtype=int)
+        return state
+
+    def is_alone(self, index: int) -> bool:
+        """Whether the client at position ``index`` has left what the others share."""
+        return bool(self.model.screening > 0 and self.begin()["alone"][index])
+
+    def refused(self, candidates: Mapping[int, Payload]) -> set[int]:
+        """The clients that do not take what they were sent, after the tests that are due.
+
+        :param candidates: by position, the parameters that a client would then have
+        """
+        model, state = self.model, self.begin()
+        episodes = {index: self._affordable(index) for index in candidates}
+        episodes = {index: n for index, n in episodes.items() if n > 0 and model.round >= state["next_round"][index]}
+        for index, (own, other) in self._test(candidates, episodes).items():
+            scale = self._scale(index, own)
+            alone = bool(state["alone"][index])
+            if alone:
+                changes = clearly_better(other, own, RETURN * scale)
+            else:
+                changes = clearly_better(own, other, LEAVE * scale)
+            state["alone"][index] = alone != changes
+            state["wait"][index] = 1 if changes else min(2 * state["wait"][index], LONGEST_WAIT)
+            state["next_round"][index] = model.round + state["wait"][index]
+            model.record_client(model.client_ids[index], "screening_own", float(own.mean()))
+            model.record_client(model.client_ids[index], "screening_sent", float(other.mean()))
+        model.logger.record("screening/alone", float(state["alone"].sum()))
+        model.logger.record("screening/test_steps", model.test_steps)
+        return {index for index in candidates if state["alone"][index]}
+
+    def _affordable(self, index: int) -> int:
+        """Episodes of either policy for which the client has steps left; 0 for none."""
+        model, state = self.model, self.begin()
+        lengths = [info["l"] for info in model.episode_infos[index]]
+        if not lengths or not model.has_trained[index]:
+            return 0
+        planned = model.screening * model._total_timesteps / model.n_participants
+        left, pair = planned - state["steps"][index], 2 * float(np.mean(lengths))
+        return 0 if left < pair else max(1, min(EPISODES, int(PART * left / pair)))
+
+    def _scale(self, index: int, own: np.ndarray) -> float:
+        """What differences between returns are measured in: the level of the client's own, or how far its returns in training
+        lie apart where that is more."""
+        returns = [info["r"] for info in self.model.episode_infos[index]]
+        return max(abs(float(own.mean())), float(np.std(returns)))
+
+    def _test(
+        self, candidates: Mapping[int, Payload], episodes: Mapping[int, int]
+    ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """Returns of the clients' own policies and of the candidates, ``(episodes,)`` each; the policies stay as they were."""
+        if not episodes:
+            return {}
+        model = self.model
+        if self._env is None:
+            self._env = evaluation_env(model, EPISODES)
+        active = np.zeros((model.n_clients, EPISODES), dtype=bool)
+        for index, n in episodes.items():
+            active[index, :n] = True
+        assert model.seed is not None
+        seed = int(stream(model.seed, Role.SCREENING, model.round).integers(2**31))
+        results = []
+        for policies in ({}, {index: candidates[index] for index in episodes}):
+            own = {index: model._parameters(index) for index in policies}
+            for index, parameters in policies.items():
+                model.policy.load_client(index, parameters)
+            tested = evaluate_federation(lambda obs: model.predict(obs, deterministic=True)[0], self._env, seed, active)
+            for index, parameters in own.items():
+                model.policy.load_client(index, parameters)
+            steps = np.where(active, tested.lengths, 0).sum(axis=1)
+            self.begin()["steps"][:] += steps
+            model.test_steps += int(steps.sum())
+            results.append(tested.returns)
+        return {index: (results[0][index, :n], results[1][index, :n]) for index, n in episodes.items()}
+
+
+def clearly_better(returns: np.ndarray, others: np.ndarray, margin: float) -> bool:
+    """Whether paired returns are above the others' by more than two standard errors of the difference and by ``margin``."""
+    difference = returns - others
+    n = len(difference)
+    error = float(difference.std(ddof=1)) / math.sqrt(n) if n > 1 else 0.0
+    return float(difference.mean()) > max(2 * error, margin)
+
+
+def check_screening(screening: float, average: str) -> None:
+    """:raises ValueError: for a share outside [0, 0.5], or where no policy is sent that could be tested"""
+    if not 0 <= screening <= 0.5:
+        raise ValueError(f"screening={screening} must lie in [0, 0.5]: it is the share of environment steps spent on tests")
+    if screening > 0 and average == "critic":
+        raise ValueError("screening tests policies, and average='critic' sends none; use 'all' or 'actor', or screening=0")
