@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sb3_fedguide.algorithms.fedrl import FedRL
     from sb3_fedguide.algorithms.fedsvrpgm import FedSVRPGM
     from sb3_fedguide.algorithms.local import Local
+    from sb3_fedguide.algorithms.pooled import Pooled
     from sb3_fedguide.common.evaluation import FederatedEvalCallback, evaluate_federation
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
@@ -41,6 +42,7 @@ _LAZY = {
     "FedRL": "sb3_fedguide.algorithms.fedrl",
     "FedSVRPGM": "sb3_fedguide.algorithms.fedsvrpgm",
     "Local": "sb3_fedguide.algorithms.local",
+    "Pooled": "sb3_fedguide.algorithms.pooled",
     "TensorBoardCallback": "sb3_fedguide.monitoring.callbacks",
     "FederatedDDPG": "sb3_fedguide.common.federated_ddpg",
     "FederatedEvalCallback": "sb3_fedguide.common.evaluation",
@@ -64,6 +66,7 @@ __all__ = [
     "FederatedEvalCallback",
     "FederatedPPO",
     "Local",
+    "Pooled",
     "TensorBoardCallback",
     "__version__",
     "evaluate_federation",

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 #: command-line name to module and class
 ALGORITHMS: dict[str, tuple[str, str]] = {
     "local": ("sb3_fedguide.algorithms.local", "Local"),
+    "pooled": ("sb3_fedguide.algorithms.pooled", "Pooled"),
     "fedavg": ("sb3_fedguide.algorithms.fedavg", "FedAvg"),
     "fedprox": ("sb3_fedguide.algorithms.fedprox", "FedProx"),
     "fedkl": ("sb3_fedguide.algorithms.fedkl", "FedKL"),

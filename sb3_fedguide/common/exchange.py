@@ -20,6 +20,8 @@ class Exchange(BaseAlgorithm):
 
     #: name of the server's side in :data:`sb3_fedguide.server.build.METHODS`
     server_method: ClassVar[str] = "local"
+    #: whether every client's data may stay where it is; what is not federated cannot be divided among processes or machines
+    is_federated: ClassVar[bool] = True
     strategy: Strategy | None
     upload_bound: float | None
     normalizer: FederatedNormalizer

@@ -99,7 +99,7 @@ class FederatedNormalizer:
         if self.norm_obs:
             self.obs.update(obs, present)
             if self.shared:
-                self.round_obs.update(obs, present)
+                self.round_obs.update(obs.astype(np.float64), present)
 
     def begin_round(self, present: np.ndarray) -> None:
         """Forget the last round's moments of the clients ``present``, ``(n_clients,)`` bool: they were uploaded or are lost."""

@@ -46,6 +46,8 @@ class Engine(ABC):
         """
         if model.device.type != "cpu":
             raise ValueError(f"engines train on CPUs, and the device is {model.device}; use device='cpu', or no engine")
+        if not model.is_federated:
+            raise ValueError(f"{type(model).__name__} needs all clients in one process; leave the engine out")
         for engine in {self, model.engine or self}:
             engine.close()
         n_groups = min(self.num_actors, model.n_clients)

@@ -68,6 +68,7 @@ _PPO_AVERAGING = Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), _AVERAGING
 #: Command-line name of an algorithm to its server's side.
 METHODS: dict[str, Method] = {
     "local": Method(lambda settings, n_clients, seed: None, {}),
+    "pooled": Method(lambda settings, n_clients, seed: None, {}),
     "fedavg": _PPO_AVERAGING,
     "fedprox": _PPO_AVERAGING,
     "fedkl": _PPO_AVERAGING,

@@ -12,6 +12,10 @@ from sb3_fedguide.server.payload import OBSERVATION_COUNT, OBSERVATION_MEAN, OBS
 from sb3_fedguide.server.strategy import Strategy
 
 
+#: Weight of mean 0 and variance 1 before anything is known, as in SB3's ``RunningMeanStd``.
+START_COUNT = 1e-4
+
+
 class Moments(NamedTuple):
     """Of ``count`` samples; mean and (population) variance by coordinate, float64."""
 
@@ -42,7 +46,7 @@ class ObservationMoments(Strategy):
 
     A client uploads count, mean and variance of its last round's raw observations, and receives those of all observations
     that all clients have uploaded since the beginning: with the mean as aggregator they are exact, and do not depend on the
-    order in which uploads come. Before the first round one exchange pools what the clients know from their offline data.
+    order in which uploads come, but for :data:`START_COUNT`. Before the first round one exchange pools what the clients know from their offline data.
 
     :param aggregator: what takes the place of the pooled mean and variance of a round: by coordinate the median or trimmed
         mean of the clients' means, and of their mean squared distances from it
@@ -83,8 +87,11 @@ class ObservationMoments(Strategy):
             mean = robust_mean(means, self.aggregator, self.trim_fraction)
             var = robust_mean(variances + (means - mean) ** 2, self.aggregator, self.trim_fraction)
             pooled = [Moments(sum(part.count for part in parts), mean, var)]
-        if self.mean is not None and self.var is not None:
-            pooled = [Moments(self.count, self.mean, self.var), *pooled]
+        if self.mean is None or self.var is None:
+            start = Moments(START_COUNT, np.zeros_like(parts[0].mean), np.ones_like(parts[0].var))
+        else:
+            start = Moments(self.count, self.mean, self.var)
+        pooled = [start, *pooled]
         self.count, self.mean, self.var = merge(pooled)
 
     def latest(self, client: int) -> Payload:

@@ -1,0 +1,60 @@
+"""Pooled: one PPO on the data of all clients, the upper bound of what sharing can give. It is not federated."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Unpack
+
+import torch as th
+
+from sb3_fedguide.common.arguments import FederatedPPOArguments
+from sb3_fedguide.common.federated_ppo import FederatedPPO
+from sb3_fedguide.common.federation import FederationLike, PolicyLike
+from sb3_fedguide.common.rollout_buffer import FederatedSamples
+from sb3_fedguide.offline.pretraining import Pretraining
+
+#: What a one-hot client vector as a further input of both networks is: a first-layer bias for each client.
+CLIENT_INPUT = ("mlp_extractor.policy_net.0.bias", "mlp_extractor.value_net.0.bias")
+
+
+class Pooled(FederatedPPO):
+    """PPO on the rollouts of all clients together, with one policy that sees which client it acts for.
+
+    All clients' trajectories are in one place, which no federation allows: a control that says what is lost by keeping them
+    apart. A minibatch is ``batch_size`` rows of every client. The client vector is one-hot, and its weights are the clients'
+    own first-layer biases; all other parameters are one network's, so each client takes the mean of the clients' gradients.
+
+    Parameters are those of :class:`FederatedPPO`.
+
+    :raises ValueError: for ``client_fraction`` below 1
+    """
+
+    server_method = "pooled"
+    is_federated: ClassVar[bool] = False
+
+    def __init__(self, policy: PolicyLike, env: FederationLike | None, **ppo: Unpack[FederatedPPOArguments]) -> None:
+        if ppo.get("client_fraction", 1.0) != 1.0:
+            raise ValueError("Pooled has all clients' data in every minibatch; leave client_fraction at 1")
+        super().__init__(policy, env, **ppo)
+
+    @th.no_grad()
+    def _pretrain(self, stage: Pretraining) -> None:
+        for parameter in self.policy.parameters():  # one network, from the mean of the cloned ones
+            parameter.copy_(parameter.mean(dim=0, keepdim=True).expand_as(parameter))
+
+    def _transform_gradients(self, data: FederatedSamples) -> None:
+        """The gradient of the mean loss, its norm clipped as a whole."""
+        square = th.zeros((), device=self.device)
+        gradients = []
+        for name, parameter in self.policy.named_parameters():
+            gradient = parameter.grad
+            assert gradient is not None
+            if name in CLIENT_INPUT:
+                gradient.div_(self.n_clients)
+                square = square + (gradient**2).sum()
+            else:
+                gradient.copy_(gradient.mean(dim=0, keepdim=True).expand_as(gradient))
+                square = square + (gradient[0] ** 2).sum()
+            gradients.append(gradient)
+        scale = th.clamp(self.max_grad_norm / (square.sqrt() + 1e-6), max=1.0)
+        for gradient in gradients:
+            gradient.mul_(scale)
