@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 
 from fed_envs.faults import ClientError
 from sb3_fedguide import Local
-from sb3_fedguide.algorithms import ALGORITHMS
+from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.train import main
 from sb3_fedguide.engines import make_engine
 from sb3_fedguide.engines.client_axis import join_clients, take_clients
@@ -59,7 +59,7 @@ def assert_same_training(plain, other) -> None:
 
 
 @pytest.mark.parametrize("fraction", [1.0, 0.4])
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", [name for name in ALGORITHMS if algorithm(name).is_federated])
 def test_groups_elsewhere_learn_the_same(algo, fraction, tmp_path):
     def run(engine: Engine | None):
         model = make(algo, "Reacher", clients=[0, 3, 4, 6, 7], client_fraction=fraction)

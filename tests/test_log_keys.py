@@ -34,6 +34,8 @@ SETTINGS: dict[str, list[dict]] = {
     "fedrl": [{"rollout_size": 32, "learning_starts": 8, "batch_size": 8, "seed": 0, "policy_kwargs": {"net_arch": [8]}}],
     "fedguide": [GUIDED, {**GUIDED, "prior_loss": "sample", "adapt": "advantage"}],
     "fedguide-p": [GUIDED],
+    "pooled": [PPO],
+    "fedguide-r": [{**PPO, "screening": 0.5, "normalize": "shared"}],
     "fedguide-a": [{**GUIDED, "average_every": 1}],
 }
 

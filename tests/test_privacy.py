@@ -92,7 +92,7 @@ def trained(name: str, tmp_path, **settings):
         settings = {"learning_starts": 20, "buffer_size": 100, **settings}
     else:
         settings = {"n_epochs": 1, **settings}
-    if name.startswith("fedguide"):
+    if algorithm(name).uses_prior:
         settings = {"prior_states": 8, "adapt": "advantage", "n_experts": 5, **settings}
     if name == "fedguide-a":
         settings["average_every"] = 2
@@ -127,10 +127,10 @@ def test_what_is_uploaded_is_what_the_page_says(name, uploads, offline_uploads, 
 
     offline = documented_parts("Uploads in the offline stage", sizes)
     for part, sent in offline_uploads.items():
-        assert len(sent) == (model.n_clients * (1 if part == "moments" else 2) if name.startswith("fedguide") else 0)
+        assert len(sent) == (model.n_clients * (1 if part == "moments" else 2) if model.uses_prior else 0)
         for payload in sent:
             assert {key: np.shape(array) for key, array in payload.items()} == offline[part]
-    if name.startswith("fedguide"):
+    if model.uses_prior:
         n_values = sum(int(np.prod(shape)) for shape in offline["moments"].values())
         n_values += 2 * sum(int(np.prod(shape)) for shape in offline["trunk"].values())
         assert model.pretraining_bytes[0] == 4 * n_values * model.n_clients

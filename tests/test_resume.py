@@ -29,7 +29,8 @@ OWN = {
     "fedrl": {"learning_starts": 20, "buffer_size": 90, "train_freq": 8},  # the ring is full in the third round
     "fedguide": {"adapt": "advantage", "calibrate": True, "beta": "auto", "prior_states": 32},
     "fedguide-p": {"prior_loss": "sample", "cost": "param"},
-    "fedguide-a": {"average_every": 2, "n_experts": 2},
+    "fedguide-a": {"average_every": 2, "n_experts": 2, "server_momentum": 0.5},
+    "fedguide-r": {"normalize": "shared", "screening": 0.5, "mix": 0.7},
 }  # fmt: skip
 
 
@@ -64,6 +65,7 @@ def train(model, rounds: int, csv_path: Path, folder: Path | None = None) -> tup
 @pytest.mark.parametrize("algo", ALGORITHMS)
 @pytest.mark.parametrize(("env", "more"), [("Bandit2D", {}), ("ReacherHard", {"client_fraction": 0.5})])
 def test_a_new_object_goes_on_from_a_checkpoint(algo, env, more, tmp_path, monkeypatch):
+    more = more if algorithm(algo).is_federated else {}
     whole = make(algo, env, **more)
     whole_log, whole_evaluation = train(whole, ROUNDS, tmp_path / "whole.csv")
     # The one that is stopped goes on for a round whose evaluations are in the file already, and then is lost.

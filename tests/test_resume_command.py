@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from fed_envs.state import freeze
-from sb3_fedguide.algorithms import ALGORITHMS
+from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.run_folder import exclusive
 from sb3_fedguide.cli.train import main
 from sb3_fedguide.common.array_files import read_arrays
@@ -63,7 +63,7 @@ GUIDE = (
 
 
 def arguments(algo: str, env: str, folder: Path, rounds: int = 6) -> list[str]:
-    guide = algo.startswith("fedguide")
+    guide = algorithm(algo).uses_prior
     offline = OFFLINE_STAGE + " " + GUIDE if guide else "bc_weight:0"
     params = f"{SETTINGS} {DDPG if algo == 'fedrl' else PPO} {offline}".split()
     return [

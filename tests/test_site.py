@@ -39,6 +39,7 @@ OWN: dict[str, dict[str, Any]] = {
     "fedsvrpgm": {"reference_every": 2},
     "fedguide-a": {"average_every": 2, "adapt": "advantage", "beta": "auto", "calibrate": True},
     "fedguide-p": {"prior_loss": "sample"},
+    "fedguide-r": {"normalize": "shared", "screening": 0.5, "mix": lambda remaining: 2 * remaining},
 }
 
 
@@ -51,7 +52,7 @@ def family(name: str) -> Family:
 
 def make(algo: str, env: str, clients: list[int] | None = None, **more: Any) -> Federation:
     settings = copy.deepcopy({**COMMON, **OWN.get(algo, {}), **more})  # SB3 writes into policy_kwargs
-    if algo.startswith("fedguide"):
+    if algorithm(algo).uses_prior:
         settings = {"prior_states": 16, **settings}
     return algorithm(algo)("MlpPolicy", family(env), clients=clients, **settings)
 
@@ -73,7 +74,7 @@ def in_process(algo: str, env: str, **more: Any) -> Federation:
     model = make(algo, env, **more)
     model.learn(N_ROUNDS * model.rollout_size * model.n_participants)
     for index in np.flatnonzero(model.outdated):
-        model.receive(index, model.strategy.catch_up(model.client_ids[index]))
+        model.take_broadcasts({index: model.strategy.catch_up(model.client_ids[index])})
     return model
 
 
@@ -88,7 +89,7 @@ def assert_equal(transport: LoopTransport, model: Federation) -> None:
             np.testing.assert_array_equal(site.heads[0], model.heads[client])
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", [name for name in ALGORITHMS if algorithm(name).is_federated])
 def test_three_sites_learn_what_three_clients_learn_in_one_process(algo, tmp_path):
     config, transport = federation(algo, "Bandit2D", tmp_path, fresh=True)
     server = serve(config, transport, tmp_path / "server")

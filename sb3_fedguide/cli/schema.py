@@ -10,6 +10,7 @@ import re
 import types
 import typing
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import pydantic
@@ -23,8 +24,9 @@ NOT_HYPERPARAMETERS = {
     "_init_setup_model",
 }  # fmt: skip
 
-#: A value that falls linearly to zero over the run, as in rl-baselines3-zoo.
-SCHEDULE = re.compile(r"^lin_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)?)$")
+#: A value that falls linearly to zero over the run, as in rl-baselines3-zoo; or one until a share of the run is over, then
+#: zero.
+SCHEDULE = re.compile(r"^(?P<kind>lin|until)_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)?)$")
 
 _OPEN = 1e-12  # smallest value of what must be positive
 
@@ -182,6 +184,10 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
     number = value
     if schedule and isinstance(value, str) and (match := SCHEDULE.match(value)):
         number = float(match["value"])
+        if match["kind"] == "until":
+            if name != "mix":
+                raise ValueError(f"{name}={value!r} is a schedule of mix alone; other values take one such as lin_3e-4")
+            Until(number)
     else:
         try:
             union: Any = functools.reduce(operator.or_, options)
@@ -216,12 +222,31 @@ def check_model(name: str, model: type[pydantic.BaseModel], value: Any, excluded
 
 
 def schedule_or_value(value: Any) -> Any:
-    """SB3's schedule for a string such as ``lin_3e-4``; anything else as it is."""
+    """The schedule of a string such as ``lin_3e-4`` or ``until_0.5``; anything else as it is."""
     if isinstance(value, str) and (match := SCHEDULE.match(value)):
+        if match["kind"] == "until":
+            return Until(float(match["value"]))
         from stable_baselines3.common.utils import LinearSchedule
 
         return LinearSchedule(float(match["value"]), 0.0, 1.0)
     return value
+
+
+@dataclass(frozen=True)
+class Until:
+    """One until ``share`` of the run is over, then zero; of the remaining progress, as SB3's schedules.
+
+    :raises ValueError: for a share outside [0, 1]
+    """
+
+    share: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"until_{self.share:g} must be between until_0 and until_1: it is a share of the run")
+
+    def __call__(self, progress_remaining: float) -> float:
+        return 1.0 if progress_remaining > 1 - self.share + 1e-9 else 0.0
 
 
 def _check_range(name: str, number: float) -> None:

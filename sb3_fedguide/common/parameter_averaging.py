@@ -34,8 +34,8 @@ class ParameterAveraging(Federation):
         for FedExP's, see :func:`~sb3_fedguide.server.averaging.fedexp_step`
     :param server_momentum: share of the server's last update that is added to the next one
     :param mix: share of what the server sends that a client takes into its own parameters: a number, or a schedule of the
-        remaining progress, from 1 to 0, that leaves everybody with a policy of its own at the end. Above 1 it is 1: ``lin_2``
-        in a configuration takes all for half of the run, and falls to nothing over the other half
+        remaining progress, bounded to [0, 1]. In a configuration ``lin_1`` falls from all to nothing over the run, and
+        ``until_0.5`` takes all for half of the run and nothing after it, so that everybody ends with a policy of its own
     :param screening: share of its environment steps that a client may spend on tests of what the server sends against its own
         policy, see :class:`~sb3_fedguide.common.screening.Screening`; with 0 it takes it untested
     """
@@ -90,7 +90,7 @@ class ParameterAveraging(Federation):
         payload = super().upload(index)
         if not averaging_is_due(self.round, self.average_every, self.average_until):
             return payload
-        if self._tests.is_alone(index):
+        if self._tests.is_alone(index) or self._mix() == 0:  # nothing of it is to move the others
             return {**payload, N_SAMPLES: np.array(0, dtype=np.float32)}
         return {**payload, **self._policy_upload(index)}
 
@@ -112,13 +112,17 @@ class ParameterAveraging(Federation):
             if name.startswith(self.averaged_prefixes)
         }
 
+    def _mix(self) -> float:
+        """The share that clients take now, in [0, 1]."""
+        return min(1.0, max(0.0, self.mix(self._current_progress_remaining))) if callable(self.mix) else self.mix
+
     def complete_state(self) -> None:
         super().complete_state()
         if self.screening:
             self._tests.begin()
 
     def take_broadcasts(self, broadcasts: Mapping[int, Payload]) -> None:
-        mix = min(1.0, self.mix(self._current_progress_remaining)) if callable(self.mix) else self.mix
+        mix = self._mix()
         # who has nothing of its own, or nothing to do with what the others have, takes all or nothing
         self._shares = {
             index: 1.0 if self._tests.is_alone(index) or not self.has_trained[index] else mix for index in broadcasts
