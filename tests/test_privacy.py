@@ -136,6 +136,18 @@ def test_what_is_uploaded_is_what_the_page_says(name, uploads, offline_uploads, 
         assert model.pretraining_bytes[0] == 4 * n_values * model.n_clients
 
 
+def test_shared_statistics_are_a_part_of_their_own(uploads, tmp_path):
+    model = trained("fedguide-r", tmp_path, normalize="shared")
+    parts = documented_parts("Uploads in training", sizes_of(model))
+    for round, _, payload in uploads:
+        expected = expected_shapes(parts, ["actor", "critic", "samples", "statistics"] if round else ["statistics"])
+        assert {key: np.shape(array) for key, array in payload.items()} == expected
+        kinds = {key: array.dtype for key, array in payload.items()}
+        assert all(kind == (np.float64 if key.startswith("observations.") else np.float32) for key, kind in kinds.items())
+    model.screening_state["alone"][0] = True
+    assert {key: float(array) for key, array in model.upload(0).items()} == {"n_samples": 0.0}
+
+
 def test_the_options_that_the_page_mentions(uploads, tmp_path):
     trained("fedguide", tmp_path, cost="param")
     assert {tuple(payload) for _, _, payload in uploads} == {("prior.head",)}
