@@ -158,7 +158,7 @@ def _numbers(evaluation: Evaluation) -> dict[str, Any]:
         "worst_client": evaluation.worst_client,
         "client_returns": evaluation.client_returns.tolist(),
         "client_return_std": evaluation.returns.std(axis=1).tolist(),
-        "success_rates": evaluation.success_rates.tolist() if evaluation.success_rates is not None else None,
+        "success_rates": evaluation.success_list,
         "client_lengths": evaluation.lengths.mean(axis=1).tolist(),
         "returns": evaluation.returns.tolist(),
     }
