@@ -63,7 +63,9 @@ def train_parser(prog: str) -> OneLineParser:
          "itself sends no policy")  # fmt: skip
     flag("--no-eval", action="store_true", help="do not evaluate")
     flag("--save-freq", type=int, default=10, metavar="ROUNDS", help="rounds between checkpoints; 0: none")
-    flag("--resume", metavar="RUN", help="go on with the run in this folder, with its own settings")
+    flag("--resume", metavar="RUN", help="go on with the run in this folder, with its own settings; with --rounds or -n "
+         "for longer")  # fmt: skip
+    flag("-i", "--trained-agent", metavar="RUN", help="start from what a run has learned: its folder, or its parameters.npz")
     flag("--picture-freq", type=int, default=20, metavar="ROUNDS", help="rounds between pictures in TensorBoard; 0: none")
     flag("-P", "--progress", action="store_true", help="progress bars")
     flag("--device", default="cpu", help="PyTorch device, e.g. cpu or cuda")

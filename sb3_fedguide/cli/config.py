@@ -135,11 +135,15 @@ def resolve(
     if n_timesteps is not None:
         if n_timesteps < 1:
             raise ValueError(f"n_timesteps={n_timesteps} must be at least 1; it counts the steps of all clients together")
-        from sb3_fedguide.server.participants import n_participants
-
-        present = n_participants(values["client_fraction"], family.n_clients)
-        values["n_rounds"] = -(-n_timesteps // (values["rollout_size"] * present))
+        values["n_rounds"] = rounds_of(values, family.n_clients, n_timesteps)
     return Config(algo, applied, values)
+
+
+def rounds_of(values: Mapping[str, Any], n_clients: int, n_timesteps: int) -> int:
+    """Rounds of ``n_timesteps`` steps of all clients together."""
+    from sb3_fedguide.server.participants import n_participants
+
+    return -(-n_timesteps // (values["rollout_size"] * n_participants(values["client_fraction"], n_clients)))
 
 
 def complete(given: Mapping[str, Any], algo: str) -> dict[str, Any]:
