@@ -33,10 +33,7 @@ class FactoryBatch(Batch[Any]):
         row, shape = -1, self.observations.shape[1:]
         try:
             for row in rows:
-                result = self.envs[row].step(actions[row])
-                if not isinstance(result, (tuple, list)) or len(result) != 5 or not isinstance(result[4], dict):
-                    raise ContractError(f"has to return {_STEP}, as in Gymnasium, and returned {_described(result)}")
-                check_shape(result[0], shape)
+                result = check_step(self.envs[row].step(actions[row]), shape)
                 self.observations[row], reward, terminated, truncated, self._infos[row] = result
                 self.rewards[row], self.terminated[row] = _scalar(reward), _scalar(terminated)
                 self.truncated[row] = _scalar(truncated)
@@ -157,6 +154,17 @@ def check_shape(observation: Any, shape: tuple[int, ...]) -> None:
     """:raises ValueError: for an observation of another shape, which NumPy may stretch without a word"""
     if np.shape(observation) != shape:
         raise ValueError(f"the observation has the shape {np.shape(observation)}, the observation space {shape}")
+
+
+def check_step(result: Any, shape: tuple[int, ...]) -> Any:
+    """What a step returned, as it is.
+
+    :raises ContractError: where that is something else than Gymnasium's five values
+    """
+    if not isinstance(result, (tuple, list)) or len(result) != 5 or not isinstance(result[4], dict):
+        raise ContractError(f"has to return {_STEP}, as in Gymnasium, and returned {_described(result)}")
+    check_shape(result[0], shape)
+    return result
 
 
 def reset_env(env: gymnasium.Env, seed: int | None, options: dict[str, Any] | None, shape: tuple[int, ...]) -> Any:

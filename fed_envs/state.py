@@ -60,7 +60,8 @@ def gives_state(env: gymnasium.Env) -> bool:
 
 
 def _has_methods(env: gymnasium.Env) -> bool:
-    return hasattr(env, "save_state") or hasattr(env, "load_state")  # with one of them, the other one is missed
+    # With one of the two, the other one is missed. An environment around another one says whether that one has them.
+    return getattr(env, "gives_state", True) and (hasattr(env, "save_state") or hasattr(env, "load_state"))
 
 
 def save_state(env: gymnasium.Env) -> State:

@@ -86,7 +86,10 @@ class FederatedVecEnv(VecEnv):
         else:
             self.name, factories = "custom", list(family)
             if not factories or not all(callable(factory) for factory in factories):
-                raise ValueError("a list of environments must have one function per client, each returning a new environment")
+                raise ValueError(
+                    "a list of environments must have one function per client, each returning a new environment; of "
+                    "registered ids, make a family with fed_envs.gymnasium_family(ids)"
+                )
             if render_mode is not None:
                 raise ValueError("environments from functions bring their own render_mode; give it there")
         self.client_ids = _checked_clients(clients, len(factories), self.name)

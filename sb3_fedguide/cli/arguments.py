@@ -37,7 +37,14 @@ def train_parser(prog: str) -> OneLineParser:
     )
     flag = parser.add_argument
     flag("--algo", default="fedguide", metavar="ALGO", help=", ".join(ALGORITHMS))
-    flag("--env", metavar="FAMILY", help="family of client environments, e.g. HopperHard")
+    flag("--env", metavar="FAMILY", help="family of client environments, e.g. HopperHard; or Gymnasium ids, one per client: "
+         "Arm-v0,Arm-v1,Arm-v2; or one id with --client-kwargs")  # fmt: skip
+    flag(
+        "--client-kwargs",
+        metavar="FILE",
+        help="YAML list of keyword arguments of Gymnasium's environments, an entry per client",
+    )
+    flag("--env-kwargs", nargs="+", action="extend", default=[], metavar="KEY:VALUE", help="keyword arguments of all of them")
     flag("--gym-packages", nargs="+", action="extend", default=[], metavar="MODULE", help="modules to import first, which "
          "register algorithms or environments of your own")  # fmt: skip
     flag("--metadata", metavar="FILE", help="metadata file of a family of your own (python -m fed_envs.metadata generate)")

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 FREE = ("verbose", "progress", "save_freq", "picture_freq", "num_threads", "cache_dir", "gym_packages", "resume", "engine",
         "num_actors", "ray_address")  # fmt: skip
 
+PATHS = ("log_folder", "tensorboard_log", "metadata", "client_kwargs")
+
 #: Flags that may make a run longer than it was to be.
 LENGTH = ("rounds", "n_timesteps")
 
@@ -84,7 +86,11 @@ def _comparable(name: str, value: Any) -> Any:
         from sb3_fedguide.cli.run_folder import parameter_file
 
         return str(parameter_file(value))
-    return str(Path(value).absolute()) if name in ("log_folder", "tensorboard_log", "metadata") and value else value
+    return (
+        str(Path(value).absolute())
+        if name in ("log_folder", "tensorboard_log", "metadata", "client_kwargs") and value
+        else value
+    )
 
 
 def _read_yaml(folder: Path, name: str) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import parse_train
+from sb3_fedguide.cli.gymnasium_ids import is_registered, registered_family
 from sb3_fedguide.cli.names import check_names
 from sb3_fedguide.cli.resume import (
     check_length,
@@ -163,8 +164,14 @@ def find_family(arguments: argparse.Namespace) -> Family:
         name = arguments.env
         if name.startswith(ID_PREFIX) and name.endswith(ID_SUFFIX):
             name = name[len(ID_PREFIX) : -len(ID_SUFFIX)]
-        check_names([name], fed_envs.FAMILIES, "environment")
-        named = fed_envs.load_family(name)
+        ids = name.split(",")
+        if name in fed_envs.FAMILIES or not (len(ids) > 1 or is_registered(name) or arguments.client_kwargs):
+            check_names([name], fed_envs.FAMILIES, "environment")
+            named = fed_envs.load_family(name)
+        else:
+            named = registered_family(ids, arguments.client_kwargs, arguments.env_kwargs)
+    if (arguments.client_kwargs or arguments.env_kwargs) and (named is None or named.world != "gymnasium"):
+        raise ValueError("--client-kwargs and --env-kwargs are for the ids of registered environments, --env Pendulum-v1")
     if arguments.metadata is None:
         assert named is not None  # one of the two is required
         return named

@@ -51,6 +51,12 @@ def source_key(family: Family, client: int, policy: BehaviorPolicy | None = None
 
 def check_source(family: Family, client: int) -> None:
     """:raises ValueError: where nothing is known that could make the client's data"""
+    if family.world == "gymnasium":
+        raise ValueError(
+            f"{family.client(client).id} brings no offline data: give a Minari dataset with --dataset ID_OR_PATH, in Python "  # type: ignore[attr-defined]
+            "pretraining={'dataset': 'ID_OR_PATH'} ({client} in it stands for the client's number); `fedguide dataset` makes "
+            "one from logs"
+        )
     if environment_class(family.world).scripted_policy(family, client) is None:
         behavior_policy(family.backbone)
 
