@@ -21,22 +21,35 @@ from fed_envs.registration import FAMILIES, register_families, register_family, 
 
 if TYPE_CHECKING:
     from fed_envs.clients import Client
+    from fed_envs.gymnasium_world import gymnasium_family
     from fed_envs.metadata import Family, load_family
     from fed_envs.vec_env import FederatedVecEnv
 
-__all__ = ["FAMILIES", "Client", "Family", "FederatedVecEnv", "load_family", "register_family", "register_world"]
+__all__ = [
+    "FAMILIES",
+    "Client",
+    "Family",
+    "FederatedVecEnv",
+    "gymnasium_family",
+    "load_family",
+    "register_family",
+    "register_world",
+]
 
 _LAZY = {
     "Client": "fed_envs.clients",
     "Family": "fed_envs.metadata",
     "load_family": "fed_envs.metadata",
     "FederatedVecEnv": "fed_envs.vec_env",
+    "gymnasium_family": "fed_envs.gymnasium_world",
 }
 
 _SUBMODULES = (
     "bandit2d",
     "clients",
+    "factories",
     "generation",
+    "gymnasium_world",
     "locomotion",
     "metadata",
     "metaworld10",

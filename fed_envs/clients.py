@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import json
 import math
 from typing import Annotated, Any, Literal
 
@@ -19,6 +21,7 @@ BACKBONES: dict[str, tuple[str, ...]] = {
     "locomotion": ("Hopper-v5", "Walker2d-v5", "HalfCheetah-v5"),
     "metaworld": ("MetaWorld-v3",),
     "point_maze": ("PointMaze-v3",),
+    "gymnasium": ("Gymnasium",),
 }
 
 _Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
@@ -153,10 +156,42 @@ class MetaWorldClient(Client):
         return task
 
 
+class GymnasiumClient(Client):
+    """A client of a registered environment: its id, and the keyword arguments that it is made with."""
+
+    id: str
+    kwargs: dict[str, Any] = {}
+
+    @field_validator("id")
+    @classmethod
+    def _registered(cls, id: str) -> str:
+        import gymnasium
+
+        if id in gymnasium.registry:  # never "module:id": reading a file imports nothing
+            return id
+        near = difflib.get_close_matches(id, gymnasium.registry, n=1)
+        hint = f"; did you mean {near[0]!r}" if near else ""
+        raise ValueError(
+            f"no environment {id!r} is registered with Gymnasium{hint}; one of your own has to be registered by a module that "
+            "is imported first (--gym-packages)"
+        )
+
+    @field_validator("kwargs")
+    @classmethod
+    def _plain(cls, kwargs: dict[str, Any]) -> dict[str, Any]:
+        try:
+            if json.loads(json.dumps(kwargs, allow_nan=False)) == kwargs:
+                return kwargs
+        except (TypeError, ValueError):
+            pass
+        raise ValueError(f"must be numbers, texts, lists and mappings, as in JSON (got {kwargs!r})")
+
+
 CLIENT_MODELS: dict[str, type[Client]] = {
     "bandit2d": Bandit2DClient,
     "reacher": ReacherClient,
     "locomotion": LocomotionClient,
     "metaworld": MetaWorldClient,
     "point_maze": PointMazeClient,
+    "gymnasium": GymnasiumClient,
 }

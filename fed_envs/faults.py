@@ -28,6 +28,10 @@ class ClientError(ValueError):
         return ClientError, (self.clients, self.reason, self.round)
 
 
+class ContractError(ValueError):
+    """What an environment does against Gymnasium's interface; the text goes on after the name of its method."""
+
+
 class RowError(Exception):
     """An exception, its ``__cause__``, of the environment in row ``row``."""
 

@@ -20,6 +20,7 @@ ENTRY_POINTS = {
     "locomotion": "fed_envs.locomotion:LocomotionEnv",
     "metaworld": "fed_envs.metaworld10:MetaWorldEnv",
     "point_maze": "fed_envs.point_maze:PointMazeEnv",
+    "gymnasium": "fed_envs.gymnasium_world:GymnasiumEnv",
 }
 
 #: Every family's metadata file by its name: those that ship with the package, and those that a user registers.

@@ -14,14 +14,14 @@ from gymnasium.spaces import Space
 from fed_envs.plain_data import State, declared_state, freeze, generator, load_declared, thaw
 
 __all__ = [
-    "State", "attributes", "declared_state", "freeze", "generator", "load_declared", "load_state", "save_state",
+    "State", "attributes", "declared_state", "freeze", "generator", "gives_state", "load_declared", "load_state", "save_state",
     "set_attributes", "thaw",
 ]  # fmt: skip
 
-#: Attributes of Gymnasium's classes that say what an environment is, not where it stands.
+#: Attributes of Gymnasium's classes (and the file of SB3's Monitor) that say what an environment is, not where it stands.
 IDENTITY = (
     "env", "spec", "metadata", "render_mode", "observation_space", "action_space", "_np_random", "_np_random_seed",
-    "_action_space", "_observation_space", "_metadata", "_cached_spec", "_saved_kwargs",
+    "_action_space", "_observation_space", "_metadata", "_cached_spec", "_saved_kwargs", "results_writer",
 )  # fmt: skip
 
 
@@ -50,11 +50,26 @@ def _has_state(value: Any) -> bool:
     return type(value).__module__.startswith("gymnasium.wrappers")
 
 
+def gives_state(env: gymnasium.Env) -> bool:
+    """Whether an environment can be put back to where it stands: see :func:`save_state`."""
+    while isinstance(env, gymnasium.Wrapper):
+        if not _is_known(env) and not _has_methods(env):
+            return False
+        env = env.env
+    return _has_methods(env)
+
+
+def _has_methods(env: gymnasium.Env) -> bool:
+    # With one of the two, the other one is missed. An environment around another one says whether that one has them.
+    return getattr(env, "gives_state", True) and (hasattr(env, "save_state") or hasattr(env, "load_state"))
+
+
 def save_state(env: gymnasium.Env) -> State:
-    """Where an environment stands: its own state, its random generator's, and that of Gymnasium's wrappers around it.
+    """Where an environment stands: its own state, its random generator's, and that of known wrappers around it.
 
     An environment of the user's own has to have the methods ``save_state()``, which returns a dict of arrays and JSON
-    values, and ``load_state(state)``. So do wrappers other than Gymnasium's. The generator ``np_random`` is taken care of.
+    values, and ``load_state(state)``. So do wrappers other than Gymnasium's and Stable-Baselines3's ``Monitor``. The
+    generator ``np_random`` is taken care of.
 
     :raises ValueError: where they are missing
     """
@@ -90,26 +105,27 @@ def load_state(env: gymnasium.Env, state: State) -> None:
 
 
 def _wrapper_state(wrapper: gymnasium.Wrapper) -> State:
-    state = attributes(wrapper, IDENTITY) if _is_gymnasiums(wrapper) else _method(wrapper, "save_state")()
+    state = attributes(wrapper, IDENTITY) if _is_known(wrapper) else _method(wrapper, "save_state")()
     return {"class": type(wrapper).__name__, "state": freeze(state)}
 
 
 def _load_wrapper(wrapper: gymnasium.Wrapper, state: State) -> None:
-    if _is_gymnasiums(wrapper):
+    if _is_known(wrapper):
         set_attributes(wrapper, thaw(state))
     else:
         _method(wrapper, "load_state")(thaw(state))
 
 
-def _is_gymnasiums(wrapper: gymnasium.Wrapper) -> bool:
-    return type(wrapper).__module__.startswith("gymnasium.")
+def _is_known(wrapper: gymnasium.Wrapper) -> bool:
+    """Whether the wrapper's state is in plain attributes: Gymnasium's own, and SB3's ``Monitor``."""
+    return type(wrapper).__module__.startswith(("gymnasium.", "stable_baselines3.common.monitor"))
 
 
 def _method(env: gymnasium.Env, name: str) -> Callable[..., Any]:
     method = getattr(env, name, None)
     if method is None:
         raise ValueError(
-            f"{type(env).__name__} cannot be part of a checkpoint: give it the methods save_state(), which returns a dict of "
-            "arrays and JSON values that say where an episode stands, and load_state(state), which continues from there"
+            f"{type(env).__name__} has no {name}(): give it save_state(), which returns a dict of arrays and JSON values that "
+            "say where an episode stands, and load_state(state), which continues from there, or neither of them"
         )
     return method

@@ -11,47 +11,31 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
-from fed_envs.faults import ClientError, RowError, run_rows, watched
+from fed_envs.factories import (
+    EnvFactory,
+    FactoryBatch,
+    Positions,
+    check_monitor_files,
+    check_spaces,
+    make_envs,
+    monitors_without_files,
+    own_record,
+    reset_env,
+)
+from fed_envs.faults import ClientError, ContractError, RowError, run_rows, watched
 from fed_envs.metadata import Family, load_family
 from fed_envs.registration import environment_class
 from fed_envs.seeding import integer_seed
 from fed_envs.state import State, load_state, save_state
-from fed_envs.world import Batch, Runner, run_here
-
-EnvFactory = Callable[[], gymnasium.Env]
+from fed_envs.world import Batch
 
 #: To wake a thread costs as much as some five steps of a simulator, so each is given at least this many.
 MIN_ROWS_PER_THREAD = 8
-
-
-class FactoryBatch(Batch[Any]):
-    """Environments of the user's own, stepped one by one; their truncations are theirs to say."""
-
-    def __init__(self, envs: Sequence[gymnasium.Env]) -> None:
-        super().__init__(envs)  # type: ignore[arg-type]
-        self._infos: list[dict[str, Any]] = [{} for _ in envs]
-
-    def step(self, actions: np.ndarray, rows: Sequence[int], run: Runner = run_here) -> None:
-        row, shape = -1, self.observations.shape[1:]
-        try:
-            for row in rows:
-                result = self.envs[row].step(actions[row])
-                check_shape(result[0], shape)
-                self.observations[row], self.rewards[row], self.terminated[row], self.truncated[row], self._infos[row] = result
-        except Exception as error:
-            raise RowError(row) from error
-
-    def info(self, row: int) -> dict[str, Any]:
-        return dict(self._infos[row])
-
-    def infos(self) -> list[dict[str, Any]]:
-        return [dict(info) for info in self._infos]
 
 
 class FederatedVecEnv(VecEnv):
@@ -102,7 +86,10 @@ class FederatedVecEnv(VecEnv):
         else:
             self.name, factories = "custom", list(family)
             if not factories or not all(callable(factory) for factory in factories):
-                raise ValueError("a list of environments must have one function per client, each returning a new environment")
+                raise ValueError(
+                    "a list of environments must have one function per client, each returning a new environment; of "
+                    "registered ids, make a family with fed_envs.gymnasium_family(ids)"
+                )
             if render_mode is not None:
                 raise ValueError("environments from functions bring their own render_mode; give it there")
         self.client_ids = _checked_clients(clients, len(factories), self.name)
@@ -110,10 +97,9 @@ class FederatedVecEnv(VecEnv):
         self.n_envs_per_client = n_envs_per_client
         self.num_threads = num_threads
         self.role = role
-        self.envs: list[gymnasium.Env] = [factories[k]() for k in self.client_ids for _ in range(n_envs_per_client)]
-        if len({id(env.unwrapped) for env in self.envs}) != len(self.envs):
-            raise ValueError("each function must return a new environment at every call, not the same one again")
-        _check_spaces(self.envs)
+        self.envs = make_envs(factories, self.client_ids, n_envs_per_client)
+        check_spaces(self.envs, self.client_ids)
+        check_monitor_files(self.envs, self.client_ids)
         super().__init__(len(self.envs), self.envs[0].observation_space, self.envs[0].action_space)
         self._active = np.ones(self.num_envs, dtype=bool)
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
@@ -124,6 +110,7 @@ class FederatedVecEnv(VecEnv):
         self._pool: ThreadPoolExecutor | None = None
         self._batch = self._make_batch()
         self._factories = None if self.family is not None else factories
+        self._positions = Positions(self.envs)
 
     def copies(self, n_envs_per_client: int, role: int) -> FederatedVecEnv:
         """The same clients with another number of copies and other random streams, for example for evaluation.
@@ -133,7 +120,8 @@ class FederatedVecEnv(VecEnv):
         source = self.family if self.family is not None else self._factories
         if source is None:
             raise ValueError("the functions that made these environments are gone; make a FederatedVecEnv from them again")
-        return FederatedVecEnv(source, n_envs_per_client, self.client_ids, self.num_threads, role)
+        with monitors_without_files():
+            return FederatedVecEnv(source, n_envs_per_client, self.client_ids, self.num_threads, role)
 
     def _make_batch(self) -> Batch[Any]:
         if self.family is None:
@@ -164,15 +152,14 @@ class FederatedVecEnv(VecEnv):
     def reset(self) -> np.ndarray:
         for row in range(self.num_envs):
             self._reset_row(row, self._seeds[row], self._options[row])
+            self._positions.reset(row, self._seeds[row])
         self._reset_seeds()
         self._reset_options()
         return self._batch.observations.copy()
 
     def _reset_row(self, row: int, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         try:
-            observation, self.reset_infos[row] = self.envs[row].reset(seed=seed, options=options or None)
-            if self.family is None:
-                check_shape(observation, self._batch.observations.shape[1:])
+            observation, self.reset_infos[row] = reset_env(self.envs[row], seed, options, self._batch.observations.shape[1:])
         except Exception as error:
             raise self._fault([row], "reset()", error) from error
         self._batch.observations[row] = observation
@@ -182,7 +169,9 @@ class FederatedVecEnv(VecEnv):
     def _fault(self, rows: Sequence[int], call: str, error: Exception) -> ClientError:
         """What to raise for an exception that came out of the environments ``rows``."""
         clients = sorted({row // self.n_envs_per_client for row in rows})
-        reason = f"{call} of its environment raised {type(error).__name__}: {error}"
+        what = "" if isinstance(error, ContractError) else f"raised {type(error).__name__}: "
+        hint = "; as in Gymnasium, reset() takes seed and options" if "unexpected keyword argument" in str(error) else ""
+        reason = f"{call} of its environment {what}{error}{hint}"
         return ClientError([self.client_ids[client] for client in clients], reason)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -217,6 +206,7 @@ class FederatedVecEnv(VecEnv):
 
         rewards, terminated = batch.rewards, batch.terminated
         self._lengths += active
+        self._positions.moves += active
         truncated = batch.truncated | (self._lengths >= self._max_steps)
         infos = batch.infos()
         dones = terminated | truncated
@@ -235,7 +225,8 @@ class FederatedVecEnv(VecEnv):
         info["terminal_observation"] = self._batch.observations[row].copy()
         info["TimeLimit.truncated"] = truncated
         seconds = round(time.time() - self._start_time, 6)
-        info.setdefault("episode", {"r": float(self._returns[row]), "l": int(self._lengths[row]), "t": seconds})
+        episode = {"r": float(self._returns[row]), "l": int(self._lengths[row]), "t": seconds}
+        info["episode"] = own_record(info, episode)
         self._reset_row(row)
 
     def _run(self, work: Callable[[Iterator[int]], None], rows: Sequence[int]) -> None:
@@ -254,11 +245,13 @@ class FederatedVecEnv(VecEnv):
     def save_state(self) -> State:
         """Where all environments stand, as plain data: simulators, random streams, running returns, who is active.
 
-        :raises ValueError: for environments of the user's own without ``save_state`` and ``load_state``
+        Of environments without ``save_state`` and ``load_state`` it holds only how they got there.
+
+        :raises ClientError: for what an environment has in its state and is no plain data
         """
         return {
             "clients": list(self.client_ids),
-            "envs": [save_state(env) for env in self.envs],
+            "envs": [self._save_row(row) for row in range(self.num_envs)],
             "observations": self._batch.observations.copy(),
             "lengths": self._lengths.copy(),
             "returns": self._returns.copy(),
@@ -267,8 +260,20 @@ class FederatedVecEnv(VecEnv):
             "seconds": time.time() - self._start_time,
         }
 
+    def _save_row(self, row: int) -> State:
+        if self._positions.ordinary[row]:
+            return self._positions.save(row)
+        try:
+            return save_state(self.envs[row])
+        except ValueError as error:
+            client = self.client_ids[row // self.n_envs_per_client]
+            raise ClientError([client], f"its environment cannot be part of a checkpoint: {error}") from error
+
     def load_state(self, state: State) -> None:
         """Bring new environments of the same clients to where :meth:`save_state` was called.
+
+        Environments that give no state, and do not happen to stand there, begin new episodes with
+        :meth:`begin_lost_episodes`.
 
         :raises ValueError: for the state of other environments
         """
@@ -277,12 +282,38 @@ class FederatedVecEnv(VecEnv):
                 f"the state is that of {len(state['envs'])} environments of the clients {state['clients']}, not of "
                 f"{self.num_envs} of the clients {self.client_ids}"
             )
-        for env, saved in zip(self.envs, state["envs"], strict=True):
-            load_state(env, saved)
+        for row, (env, saved) in enumerate(zip(self.envs, state["envs"], strict=True)):
+            if self._positions.ordinary[row] and "moves" in saved:
+                episode = (self._lengths[row], self._returns[row]) == (state["lengths"][row], state["returns"][row])
+                seen = np.array_equal(self._batch.observations[row], state["observations"][row])
+                self._positions.load(row, saved, episode and seen)
+            else:
+                load_state(env, saved)
         self._batch.observations[:] = state["observations"]
         self._lengths[:], self._returns[:], self._active[:] = state["lengths"], state["returns"], state["active"]
         self._seeds = list(state["seeds"])
         self._start_time = time.time() - state["seconds"]
+
+    @property
+    def lost(self) -> np.ndarray:
+        """``(num_envs,)`` bool: the active environments that :meth:`load_state` could not bring to where they stood."""
+        return self._positions.lost & self._active
+
+    def begin_lost_episodes(self) -> tuple[np.ndarray, np.ndarray, list[int]]:
+        """Reset the environments that are :attr:`lost`.
+
+        :return: their indices, their observations, and the clients that lost an episode (one that had only been reset begins
+            again with the same seed)
+        """
+        positions, rows, clients = self._positions, np.flatnonzero(self.lost), set()
+        for row in rows.tolist():
+            seed, moves = positions.seeds[row], int(positions.moves[row])
+            if moves > 0:
+                seed = None if seed is None else integer_seed(seed, moves)
+                clients.add(self.client_ids[row // self.n_envs_per_client])
+            self._reset_row(row, seed)
+            positions.reset(row, seed)
+        return rows, self._batch.observations[rows], sorted(clients)
 
     def close(self) -> None:
         if self._pool is not None:
@@ -326,12 +357,6 @@ class FederatedVecEnv(VecEnv):
         return [self.envs[index] for index in self._get_indices(indices)]
 
 
-def check_shape(observation: Any, shape: tuple[int, ...]) -> None:
-    """:raises ValueError: for an observation of another shape, which NumPy may stretch without a word"""
-    if np.shape(observation) != shape:
-        raise ValueError(f"the observation has the shape {np.shape(observation)}, the observation space {shape}")
-
-
 def _checked_clients(clients: Sequence[int] | None, n_clients: int, name: str) -> list[int]:
     ids = list(range(n_clients)) if clients is None else [int(client) for client in clients]
     unknown = [client for client in ids if not 0 <= client < n_clients]
@@ -340,19 +365,3 @@ def _checked_clients(clients: Sequence[int] | None, n_clients: int, name: str) -
     if not ids or len(set(ids)) != len(ids):
         raise ValueError(f"clients must name at least one client, each once; got {ids}")
     return ids
-
-
-def _check_spaces(envs: Sequence[gymnasium.Env]) -> None:
-    first = envs[0]
-    if not isinstance(first.observation_space, spaces.Box):
-        raise ValueError(
-            f"observations must be a Box, got {first.observation_space}; "
-            "flatten others with gymnasium.wrappers.FlattenObservation"
-        )
-    for number, env in enumerate(envs):
-        for kind in ("observation_space", "action_space"):
-            if getattr(env, kind) != getattr(first, kind):
-                raise ValueError(
-                    f"all clients must share their spaces: environment {number} has {kind} {getattr(env, kind)}, "
-                    f"environment 0 has {getattr(first, kind)}"
-                )

@@ -24,6 +24,7 @@ from sb3_fedguide.common.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
+from tests.test_env_state import CountingEnv
 
 STATE = {
     "numbers": [1, 0.1, None, True, "text"],
@@ -221,9 +222,15 @@ def test_a_disk_that_is_full_does_not_end_the_training(tmp_path, monkeypatch):
     assert model.round == 3
 
 
-def test_what_cannot_be_saved_is_said_before_the_first_round(tmp_path, point_envs):
-    model = FedAvg("MlpPolicy", point_envs(2), **SMALL)
-    with pytest.raises(CheckpointError, match=r"PointEnv cannot be part of a checkpoint.*--save-freq 0"):
+class Unplain(CountingEnv):
+    def save_state(self):
+        return {"arm": object()}
+
+
+def test_what_cannot_be_saved_is_said_before_the_first_round(tmp_path):
+    model = FedAvg("MlpPolicy", [CountingEnv, Unplain], **SMALL)
+    message = r"client 1: its environment cannot be part of a checkpoint: arm: a object is no plain data.*--save-freq 0"
+    with pytest.raises(CheckpointError, match=message):
         model.learn(10**9, CheckpointCallback(tmp_path))
     assert model.round == 0 and model.num_timesteps == 0
 

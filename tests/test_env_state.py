@@ -8,11 +8,12 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import wrappers
+from stable_baselines3.common.monitor import Monitor
 
 import fed_envs
 from fed_envs import FederatedVecEnv
 from fed_envs.metadata import Family, parse_family
-from fed_envs.state import freeze, generator, load_state, save_state, thaw
+from fed_envs.state import freeze, generator, gives_state, load_state, save_state, thaw
 from tests.conftest import PointEnv
 
 #: An episode's steps here, and the steps before the state is taken: in mid-episode, but for the one-step bandit.
@@ -148,20 +149,22 @@ def test_environments_of_ones_own_in_stateful_wrappers():
     assert record(new, after) == expected
 
 
-def test_an_environment_without_the_methods_says_which(point_envs):
-    env = FederatedVecEnv(point_envs(2))
-    env.reset()
-    with pytest.raises(ValueError, match=r"PointEnv cannot be part of a checkpoint.*save_state\(\).*load_state\(state\)"):
-        env.save_state()
-
+def test_only_what_has_the_methods_everywhere_gives_its_state(point_envs):
     class Halved(gymnasium.ActionWrapper):
         def action(self, action):
             return action / 2
 
-    wrapped = Halved(CountingEnv())
-    wrapped.reset(seed=0)
-    with pytest.raises(ValueError, match="Halved cannot be part"):
-        save_state(wrapped)
+    class Forgetful(PointEnv):
+        def save_state(self):
+            return {}
+
+    assert gives_state(counting_env(0.0)) and gives_state(Monitor(CountingEnv())) and gives_state(Forgetful())
+    assert not gives_state(PointEnv()) and not gives_state(Halved(CountingEnv())) and not gives_state(Halved(Forgetful()))
+    env = FederatedVecEnv([Forgetful])
+    env.reset()
+    state = env.save_state()
+    with pytest.raises(ValueError, match=r"Forgetful has no load_state\(\): give it save_state\(\)"):
+        env.load_state(state)
 
 
 def test_states_of_other_environments_are_refused():

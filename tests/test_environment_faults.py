@@ -70,7 +70,7 @@ FAULTS = {
     "reset raises": "reset() of its environment raised OSError: the simulator is gone",
     "shape": "the observation has the shape (1,), the observation space (3,)",
     "reset shape": "the observation has the shape (1,), the observation space (3,)",
-    "four values": "step() of its environment raised ValueError",
+    "four values": "step() of its environment has to return (observation, reward, terminated, truncated, info)",
     "nan observation": "its environment returned",
     "nan final observation": "its environment returned",
     "infinite observation": "its environment returned",

@@ -17,6 +17,7 @@ import fed_envs
 from fed_envs import FederatedVecEnv
 from fed_envs.metadata import parse_family
 from sb3_fedguide.algorithms import ALGORITHMS, register_algorithm
+from sb3_fedguide.cli.evaluate import main as evaluate
 from sb3_fedguide.cli.train import main
 
 ROOT = Path(__file__).parent.parent
@@ -98,7 +99,7 @@ def test_the_example_world_keeps_the_contracts(monkeypatch, registries):
         parse_family({**json.loads((EXAMPLES / "Wind.json").read_text()), "clients": [{"client": 0, "wind": "north"}]}, "file")
 
 
-def test_fedguide_trains_in_the_example_world(tmp_path):
+def test_fedguide_trains_in_the_example_world(tmp_path, capsys):
     command = [sys.executable, str(ROOT / "train.py"), "--gym-packages", "wind_world", "--env", "Wind", "-f", str(tmp_path)]
     command += [*SMALL[:-1], "pretraining.dataset_size:200", "pretraining.bc_updates:5", "pretraining.prior_updates:5"]
     command += ["pretraining.dice_updates:5", "prior_states:20"]
@@ -106,6 +107,10 @@ def test_fedguide_trains_in_the_example_world(tmp_path):
     assert result.returncode == 0, result.stderr
     summary = json.loads((tmp_path / "fedguide" / "Wind_1" / "summary.json").read_text())
     assert summary["n_clients"] == 3 and summary["rounds_done"] == 2
+    with pytest.raises(SystemExit):
+        evaluate([str(tmp_path / "fedguide" / "Wind_1")])
+    error = capsys.readouterr().err
+    assert "must be one of" in error and "trained with --gym-packages wind_world: give that here as well" in error
 
 
 def test_taken_names_of_worlds_and_families_are_refused(tmp_path):

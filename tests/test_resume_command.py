@@ -219,7 +219,8 @@ def command(*argv: str) -> int:
 
 
 CONTRADICTIONS = {
-    "--rounds 7": "--rounds 7 contradicts the run in .*, whose own is 6",
+    "--rounds 3": "the run in .* has had 4 rounds, so it cannot be one of 3",
+    "-i elsewhere": "-i elsewhere: there is no .*elsewhere; give the folder of a trained run, or its parameters.npz",
     "--seed 1": "--seed 1 contradicts the run in .*, whose own is 0",
     "--algo fedavg": "--algo fedavg contradicts the run in .*, whose own is local",
     "--env Reacher": "--env Reacher contradicts the run in .*, whose own is Bandit2D",
@@ -256,6 +257,49 @@ def test_flags_that_agree_or_are_free_are_taken(stopped, tmp_path, capsys, monke
     assert command("--resume", "run") == 0  # and once more
     assert "the run in run is finished: it had its 6 rounds" in capsys.readouterr().out
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == content
+
+
+def test_a_finished_run_goes_on_for_longer(driver, tmp_path, capsys):
+    log = tmp_path / "log.txt"
+    assert driver(arguments("fedavg", "Bandit2D", tmp_path / "whole", 7), log) == 0
+    assert driver(arguments("fedavg", "Bandit2D", tmp_path, 3), log) == 0
+    folder = tmp_path / "fedavg" / "Bandit2D_1"
+    assert checkpoints(folder / "checkpoints")[-1].name == "round_000003.npz"  # though it is not the second's turn
+    assert driver(["--resume", str(folder), "--rounds", "7", "--save-freq", "2"], log, ["step", 160]) == -signal.SIGKILL
+    assert driver(["--resume", str(folder)], log) == 0  # it knows how long it is now
+    whole, found = results(tmp_path / "whole" / "fedavg" / "Bandit2D_1"), results(folder)
+    assert same(freeze(whole["parameters"]), freeze(found["parameters"]))
+    assert whole["summary"]["deployed"] == found["summary"]["deployed"]
+    rows = [row for row in found["csv"].splitlines() if not row.startswith("3,768,broadcast")]  # it was the last round
+    assert rows == whole["csv"].splitlines() and len(found["csv"].splitlines()) == len(rows) + 4
+    assert yaml.safe_load((folder / "args.yml").read_text())["rounds"] == 7
+    capsys.readouterr()
+    assert command("--resume", str(folder), "-n", str(7 * 4 * 64)) == 0
+    assert "is finished: it had its 7 rounds" in capsys.readouterr().out
+    assert command("--resume", str(folder), "--rounds", "6") == 2
+    assert "has had 7 rounds, so it cannot be one of 6" in capsys.readouterr().err
+    shutil.rmtree(folder / "checkpoints")
+    assert command("--resume", str(folder), "--rounds", "8") == 2
+    assert f"no checkpoint to go on from; start a new run from what it has learned with -i {folder}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("algo", ["fedavg", "fedguide"])
+def test_a_run_starts_from_what_another_has_learned(algo, driver, tmp_path, capsys):
+    log = tmp_path / "log.txt"
+    assert driver(arguments(algo, "Bandit2D", tmp_path, 2), log) == 0
+    first, second = (tmp_path / algo / f"Bandit2D_{number}" for number in (1, 2))
+    more = [*arguments(algo, "Bandit2D", tmp_path, 1), "learning_rate:1e-12", "-i"]
+    assert driver([*more, str(first)], log) == 0, log.read_text()
+    before, after = (read_arrays(folder / "parameters.npz") for folder in (first, second))
+    kept = [name for name in before if name.startswith("policy/")]
+    assert kept and all(np.allclose(before[name], after[name], atol=1e-6) for name in kept)
+    assert yaml.safe_load((second / "args.yml").read_text())["trained_agent"] == str(first / "parameters.npz")
+    if algo == "fedavg":
+        assert command(*more, str(first / "model.zip")) == 2
+        assert "would be unpickled" in capsys.readouterr().err
+        assert command(*arguments("fedrl", "Bandit2D", tmp_path, 1), "-i", str(first)) == 2
+        assert "does not fit this FedRL" in capsys.readouterr().err
+        assert not (tmp_path / "fedrl").exists()
 
 
 def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_it_used(stopped, driver, tmp_path, capsys):
@@ -347,5 +391,5 @@ def test_a_world_that_cannot_be_saved_says_so_before_it_is_trained(tmp_path, mon
     start = Bandit2DEnv._start
     monkeypatch.setattr(Bandit2DEnv, "_start", lambda env: (setattr(env, "engine", object()), start(env))[1])
     assert command(*arguments("local", "Bandit2D", tmp_path)) == 2
-    assert re.search(r"error: engine: a object is no plain data .*--save-freq 0", capsys.readouterr().err)
+    assert re.search(r"error: client 0: .*: engine: a object is no plain data .*--save-freq 0", capsys.readouterr().err)
     assert command(*arguments("local", "Bandit2D", tmp_path, 1), "--save-freq", "0") == 0

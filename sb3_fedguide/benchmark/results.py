@@ -127,7 +127,7 @@ def _result(path: Path, content: dict[str, Any]) -> Result:
         n_episodes=int(deployed["n_episodes"]),
         final=float(deployed["average"]),
         worst_client=float(deployed["worst_client"]),
-        success=None if rates is None else float(np.mean(rates)),
+        success=None if rates is None else float(np.mean([rate for rate in rates if rate is not None])),
         broadcast=None if broadcast is None else float(broadcast["average"]),
         curve={int(round): float(value) for round, value in deployed["curve"]},
         bytes_up=float(content["bytes_up"]) / rounds,

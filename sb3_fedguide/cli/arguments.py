@@ -37,7 +37,14 @@ def train_parser(prog: str) -> OneLineParser:
     )
     flag = parser.add_argument
     flag("--algo", default="fedguide", metavar="ALGO", help=", ".join(ALGORITHMS))
-    flag("--env", metavar="FAMILY", help="family of client environments, e.g. HopperHard")
+    flag("--env", metavar="FAMILY", help="family of client environments, e.g. HopperHard; or Gymnasium ids, one per client: "
+         "Arm-v0,Arm-v1,Arm-v2; or one id with --client-kwargs")  # fmt: skip
+    flag(
+        "--client-kwargs",
+        metavar="FILE",
+        help="YAML list of keyword arguments of Gymnasium's environments, an entry per client",
+    )
+    flag("--env-kwargs", nargs="+", action="extend", default=[], metavar="KEY:VALUE", help="keyword arguments of all of them")
     flag("--gym-packages", nargs="+", action="extend", default=[], metavar="MODULE", help="modules to import first, which "
          "register algorithms or environments of your own")  # fmt: skip
     flag("--metadata", metavar="FILE", help="metadata file of a family of your own (python -m fed_envs.metadata generate)")
@@ -63,7 +70,9 @@ def train_parser(prog: str) -> OneLineParser:
          "itself sends no policy")  # fmt: skip
     flag("--no-eval", action="store_true", help="do not evaluate")
     flag("--save-freq", type=int, default=10, metavar="ROUNDS", help="rounds between checkpoints; 0: none")
-    flag("--resume", metavar="RUN", help="go on with the run in this folder, with its own settings")
+    flag("--resume", metavar="RUN", help="go on with the run in this folder, with its own settings; with --rounds or -n "
+         "for longer")  # fmt: skip
+    flag("-i", "--trained-agent", metavar="RUN", help="start from what a run has learned: its folder, or its parameters.npz")
     flag("--picture-freq", type=int, default=20, metavar="ROUNDS", help="rounds between pictures in TensorBoard; 0: none")
     flag("-P", "--progress", action="store_true", help="progress bars")
     flag("--device", default="cpu", help="PyTorch device, e.g. cpu or cuda")

@@ -135,11 +135,15 @@ def resolve(
     if n_timesteps is not None:
         if n_timesteps < 1:
             raise ValueError(f"n_timesteps={n_timesteps} must be at least 1; it counts the steps of all clients together")
-        from sb3_fedguide.server.participants import n_participants
-
-        present = n_participants(values["client_fraction"], family.n_clients)
-        values["n_rounds"] = -(-n_timesteps // (values["rollout_size"] * present))
+        values["n_rounds"] = rounds_of(values, family.n_clients, n_timesteps)
     return Config(algo, applied, values)
+
+
+def rounds_of(values: Mapping[str, Any], n_clients: int, n_timesteps: int) -> int:
+    """Rounds of ``n_timesteps`` steps of all clients together."""
+    from sb3_fedguide.server.participants import n_participants
+
+    return -(-n_timesteps // (values["rollout_size"] * n_participants(values["client_fraction"], n_clients)))
 
 
 def complete(given: Mapping[str, Any], algo: str) -> dict[str, Any]:
@@ -258,8 +262,8 @@ def _check_extent(value: Any) -> None:
             waiting += [(part, depth + 1) for part in item]
 
 
-def parse_params(pairs: Sequence[str]) -> dict[str, Any]:
-    """``key:value`` pairs of ``-params``; values are YAML scalars or lists, and nothing is evaluated.
+def parse_params(pairs: Sequence[str], flag: str = "-params") -> dict[str, Any]:
+    """``key:value`` pairs of ``-params`` or another flag; values are YAML scalars or lists, and nothing is evaluated.
 
     :raises ValueError: for a pair without a key or value, a key that is given twice, or a value that is no YAML
     """
@@ -267,13 +271,13 @@ def parse_params(pairs: Sequence[str]) -> dict[str, Any]:
     for pair in pairs:
         key, colon, text = pair.partition(":")
         if not colon or not key or not text:
-            raise ValueError(f"-params takes key:value pairs such as learning_rate:3e-4, but got {pair!r}")
+            raise ValueError(f"{flag} takes key:value pairs such as learning_rate:3e-4, but got {pair!r}")
         if key in values:
-            raise ValueError(f"-params gives {key!r} twice")
+            raise ValueError(f"{flag} gives {key!r} twice")
         try:
             values[key] = _parse_yaml(text, key)
         except ValueError:
-            raise ValueError(f"-params {key}: {text!r} is not a number, text or [list]") from None
+            raise ValueError(f"{flag} {key}: {text!r} is not a number, text or [list]") from None
     return values
 
 

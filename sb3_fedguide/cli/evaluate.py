@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
     from fed_envs import Family
+    from sb3_fedguide.cli.config import Config
     from sb3_fedguide.common.evaluation import Evaluation
     from sb3_fedguide.common.federation import Federation
 
@@ -37,7 +38,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide evaluate") -> 
     try:
         import_packages(arguments.gym_packages)
         _check(arguments)
-        run, config, family = read_run(Path(arguments.run))
+        run, config, family = _read_run(arguments)
         model = load_model(Path(arguments.run), config, family)
         policies = _policies(arguments, Path(arguments.run), model)
         if arguments.video is not None:
@@ -73,6 +74,22 @@ def _parser(prog: str) -> OneLineParser:
     flag("-o", "--output", metavar="FILE", help="write the JSON there instead of to the terminal")
     flag("--video", metavar="DIR", help="write one animated picture (GIF) of each client's first episode there")
     return parser
+
+
+def _read_run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Config, Family]:
+    """:raises ValueError: if the folder is none of a trained run, or its algorithm or world needs a module to be imported"""
+    from sb3_fedguide.cli.config import read_yaml
+
+    folder = Path(arguments.run)
+    try:
+        return read_run(folder)
+    except ValueError as error:
+        flags = read_yaml(folder / "args.yml") if (folder / "args.yml").is_file() else {}
+        modules = flags.get("gym_packages") if isinstance(flags, dict) else None
+        if not isinstance(modules, list) or set(map(str, modules)) <= set(arguments.gym_packages):
+            raise
+        needed = " ".join(map(str, modules))
+        raise ValueError(f"{error}; the run was trained with --gym-packages {needed}: give that here as well") from None
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -156,7 +173,7 @@ def _numbers(evaluation: Evaluation) -> dict[str, Any]:
         "worst_client": evaluation.worst_client,
         "client_returns": evaluation.client_returns.tolist(),
         "client_return_std": evaluation.returns.std(axis=1).tolist(),
-        "success_rates": evaluation.success_rates.tolist() if evaluation.success_rates is not None else None,
+        "success_rates": evaluation.success_list,
         "client_lengths": evaluation.lengths.mean(axis=1).tolist(),
         "returns": evaluation.returns.tolist(),
     }

@@ -13,6 +13,7 @@ USAGE = """usage: fedguide COMMAND ...
   evaluate   evaluate a finished run's policies, client by client
   benchmark  methods on families with seeds, as runs that can be interrupted, and tables of their results
   deploy     a federation over a network: certificates, keys, server and clients
+  dataset    a Minari dataset for the offline stage from CSV or NPZ logs
   demo       FedAvg beside FedGuide on Bandit2D, with a picture
 
 fedguide COMMAND --help shows a command's flags"""
@@ -34,6 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "evaluate": _evaluate,
         "benchmark": _benchmark,
         "deploy": _deploy,
+        "dataset": _dataset,
         "demo": _demo,
     }
     if arguments[0] not in commands:
@@ -63,6 +65,12 @@ def _benchmark(argv: Sequence[str]) -> int:
 
 def _deploy(argv: Sequence[str]) -> int:
     from sb3_fedguide.cli.deploy import main
+
+    return main(argv)
+
+
+def _dataset(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.dataset import main
 
     return main(argv)
 

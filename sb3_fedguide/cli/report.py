@@ -53,7 +53,7 @@ def summarize(
             "client_lengths": [float(value) for value in evaluated[policy].lengths.mean(axis=1)],
             "average": evaluated[policy].average,
             "worst_client": evaluated[policy].worst_client,
-            "success_rates": rates.tolist() if (rates := evaluated[policy].success_rates) is not None else None,
+            "success_rates": evaluated[policy].success_list,
             "n_episodes": int(evaluated[policy].returns.shape[1]),
             "curve": [list(point) for point in evaluation.curves[policy]] if evaluation is not None else [],
             "client_curve": [list(point) for point in evaluation.client_curves[policy]] if evaluation is not None else [],

@@ -7,6 +7,7 @@ import json
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,11 @@ if TYPE_CHECKING:
 #: Flags that change nothing in what a run computes, so that they may differ from the run's own.
 FREE = ("verbose", "progress", "save_freq", "picture_freq", "num_threads", "cache_dir", "gym_packages", "resume", "engine",
         "num_actors", "ray_address")  # fmt: skip
+
+PATHS = ("log_folder", "tensorboard_log", "metadata", "client_kwargs")
+
+#: Flags that may make a run longer than it was to be.
+LENGTH = ("rounds", "n_timesteps")
 
 
 def given_flags(argv: Sequence[str] | None, prog: str) -> dict[str, Any]:
@@ -51,6 +57,9 @@ def read_arguments(folder: Path, given: Mapping[str, Any], prog: str) -> argpars
     for name, value in given.items():
         if name in FREE:
             setattr(arguments, name, value)
+        elif name in LENGTH:
+            for other in LENGTH:
+                setattr(arguments, other, given.get(other))
         elif _comparable(name, value) != _comparable(name, getattr(arguments, name)):
             raise ValueError(
                 f"{flags[name]} {value} contradicts the run in {folder}, whose own is {getattr(arguments, name)}; leave it "
@@ -73,7 +82,15 @@ def _comparable(name: str, value: Any) -> Any:
         from sb3_fedguide.cli.delays import read_delays
 
         return str(read_delays(value))
-    return str(Path(value).absolute()) if name in ("log_folder", "tensorboard_log", "metadata") and value else value
+    if name == "trained_agent" and value is not None:
+        from sb3_fedguide.cli.run_folder import parameter_file
+
+        return str(parameter_file(value))
+    return (
+        str(Path(value).absolute())
+        if name in ("log_folder", "tensorboard_log", "metadata", "client_kwargs") and value
+        else value
+    )
 
 
 def _read_yaml(folder: Path, name: str) -> dict[str, Any]:
@@ -107,8 +124,32 @@ def read_settings(folder: Path, algo: str) -> tuple[Config, Family]:
     return config, read_family(folder / "metadata.json")
 
 
+def with_length(config: Config, family: Family, given: Mapping[str, Any]) -> Config:
+    """The run's settings with the length that is given now, if one is."""
+    from sb3_fedguide.cli.config import rounds_of
+
+    n_rounds = given.get("rounds")
+    if given.get("n_timesteps") is not None:
+        n_rounds = rounds_of(config.values, family.n_clients, given["n_timesteps"])
+    return config if n_rounds is None else replace(config, values={**config.values, "n_rounds": n_rounds})
+
+
+def check_length(folder: Path, config: Config, done: int) -> None:
+    """:raises ValueError: where the run has had more rounds than it is to have, or cannot have more"""
+    from sb3_fedguide.cli.run_folder import CHECKPOINTS
+    from sb3_fedguide.common.checkpoint_files import checkpoints
+
+    if config.n_rounds < done:
+        raise ValueError(f"the run in {folder} has had {done} rounds, so it cannot be one of {config.n_rounds}")
+    if config.n_rounds > done and not checkpoints(folder / CHECKPOINTS):
+        raise ValueError(
+            f"the run in {folder} has had its {done} rounds and has no checkpoint to go on from; start a new run from what it "
+            f"has learned with -i {folder}"
+        )
+
+
 def finished_rounds(folder: Path) -> int | None:
-    """How many rounds a run that is over has had; ``None`` for one that can go on."""
+    """How many rounds a run has had that came to its end; ``None`` for another."""
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         return int(summary["rounds_done"]) if summary["finished"] else None

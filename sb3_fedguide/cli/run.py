@@ -47,6 +47,7 @@ class Run:
         arguments = self.arguments
         if self.folder is not None:
             with self.lock:
+                self._record_length(self.folder)
                 with (self.folder / "command.txt").open("a", encoding="utf-8") as file:
                     file.write(self.command + "\n")
                 return self._run(self.folder)
@@ -113,6 +114,17 @@ class Run:
         self.family.dump(folder / "metadata.json")
         write_text(folder / "metadata.sha256", self.family.content_hash + "\n")
 
+    def _record_length(self, folder: Path) -> None:
+        """A run that goes on may be longer than it was to be, also when it goes on once more."""
+        from sb3_fedguide.cli.config import read_yaml
+        from sb3_fedguide.cli.run_folder import write_yaml
+
+        if read_yaml(folder / "config.yml")["n_rounds"] == self.config.n_rounds:
+            return
+        write_yaml(folder / "config.yml", self.config.values)
+        write_yaml(folder / "args.yml", {**read_yaml(folder / "args.yml"), "rounds": self.arguments.rounds,
+                                         "n_timesteps": self.arguments.n_timesteps})  # fmt: skip
+
     def _set_logger(self, folder: Path) -> None:
         from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
 
@@ -159,6 +171,8 @@ class Run:
                 except (ValueError, OSError) as error:  # no cluster at that address, or too small a one
                     raise EngineError(f"--engine {arguments.engine}: {one_message(error)}") from error
             self._learn(callbacks)
+        if checkpoint is not None and model.round >= self.config.n_rounds:
+            checkpoint.save()  # for --resume with more rounds
 
     def _learn(self, callbacks: list[RoundCallback | None]) -> None:
         model = self.model

@@ -54,6 +54,23 @@ def create_run_folder(log_folder: Path, algo: str, family: str) -> Path:
             number += 1
 
 
+def parameter_file(trained: str) -> Path:
+    """The file of what a run has learned, from its folder or its own path.
+
+    :raises ValueError: if there is none
+    """
+    path = Path(trained).absolute()
+    path = path / PARAMETERS if path.is_dir() else path
+    if path.suffix == ".zip":
+        raise ValueError(
+            f"-i {trained}: SB3's archive would be unpickled, which can execute anything; give the run's folder, or the "
+            f"{PARAMETERS} beside it (in Python, export_parameters() of the loaded model writes one)"
+        )
+    if not path.is_file():
+        raise ValueError(f"-i {trained}: there is no {path}; give the folder of a trained run, or its {PARAMETERS}")
+    return path
+
+
 @contextmanager
 def exclusive(folder: Path) -> Iterator[None]:
     """Nobody else writes to this run's folder meanwhile; the system takes the lock back from a process that dies.

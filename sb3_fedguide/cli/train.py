@@ -18,8 +18,17 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import parse_train
+from sb3_fedguide.cli.gymnasium_ids import is_registered, registered_family
 from sb3_fedguide.cli.names import check_names
-from sb3_fedguide.cli.resume import finished_rounds, given_flags, load_checkpoint, read_arguments, read_settings
+from sb3_fedguide.cli.resume import (
+    check_length,
+    finished_rounds,
+    given_flags,
+    load_checkpoint,
+    read_arguments,
+    read_settings,
+    with_length,
+)
 from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, Run, one_message
 
 if TYPE_CHECKING:
@@ -112,15 +121,19 @@ def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Call
     arguments = read_arguments(folder, given, prog)
     import_packages(arguments.gym_packages)
     config, family = read_settings(folder, arguments.algo)
+    config = with_length(config, family, given)
     from sb3_fedguide.cli.run_folder import exclusive
 
     with ExitStack() as stack:
         stack.enter_context(exclusive(folder))
         if (rounds := finished_rounds(folder)) is not None:
-            print(f"the run in {folder} is finished: it had its {rounds} rounds")
-            return lambda: 0
+            check_length(folder, config, rounds)
+            if config.n_rounds == rounds:
+                print(f"the run in {folder} is finished: it had its {rounds} rounds")
+                return lambda: 0
         run = Run(arguments, command, config, family, make_model(arguments, config, family), folder)
-        load_checkpoint(folder, run.model.resume, prog)
+        if load_checkpoint(folder, run.model.resume, prog):
+            check_length(folder, config, run.model.round)
         run.lock = stack.pop_all()
     return run
 
@@ -151,8 +164,14 @@ def find_family(arguments: argparse.Namespace) -> Family:
         name = arguments.env
         if name.startswith(ID_PREFIX) and name.endswith(ID_SUFFIX):
             name = name[len(ID_PREFIX) : -len(ID_SUFFIX)]
-        check_names([name], fed_envs.FAMILIES, "environment")
-        named = fed_envs.load_family(name)
+        ids = name.split(",")
+        if name in fed_envs.FAMILIES or not (len(ids) > 1 or is_registered(name) or arguments.client_kwargs):
+            check_names([name], fed_envs.FAMILIES, "environment")
+            named = fed_envs.load_family(name)
+        else:
+            named = registered_family(ids, arguments.client_kwargs, arguments.env_kwargs)
+    if (arguments.client_kwargs or arguments.env_kwargs) and (named is None or named.world != "gymnasium"):
+        raise ValueError("--client-kwargs and --env-kwargs are for the ids of registered environments, --env Pendulum-v1")
     if arguments.metadata is None:
         assert named is not None  # one of the two is required
         return named
@@ -174,7 +193,7 @@ def check_before_imports(arguments: argparse.Namespace) -> None:
     """
     from sb3_fedguide.cli.config import config_path, parse_params, read_config
     from sb3_fedguide.cli.delays import read_delays
-    from sb3_fedguide.cli.run_folder import check_log_folder
+    from sb3_fedguide.cli.run_folder import check_log_folder, parameter_file
     from sb3_fedguide.offline.cache import cache_folder, check_cache_folder
 
     check_names([arguments.algo], ALGORITHMS, "algorithm")
@@ -186,6 +205,8 @@ def check_before_imports(arguments: argparse.Namespace) -> None:
     check_cache_folder(cache_folder(arguments.cache_dir))
     read_config(config_path(arguments.conf_file, arguments.algo))
     parse_params(arguments.hyperparams)
+    if arguments.trained_agent is not None:
+        arguments.trained_agent = str(parameter_file(arguments.trained_agent))
     if arguments.delays is not None:
         arguments.delays = str(read_delays(arguments.delays))  # the run's own, should a file change
 
@@ -225,7 +246,9 @@ def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
     config = resolve(arguments.algo, family, arguments.conf_file, entry, given, arguments.n_timesteps)
     if config.values["pretraining"]["dataset"] is not None:
         _check_dataset(config.values["pretraining"]["dataset"], family)
-    return Run(arguments, command, config, family, make_model(arguments, config, family))
+    model = make_model(arguments, config, family)
+    model.check_offline_data()
+    return Run(arguments, command, config, family, model)
 
 
 def make_model(arguments: argparse.Namespace, config: Config, family: Family) -> FederatedPPO | FederatedDDPG:
@@ -251,6 +274,8 @@ def make_model(arguments: argparse.Namespace, config: Config, family: Family) ->
         from sb3_fedguide.common.participation import simulate_delays
 
         simulate_delays(model, read_delays(arguments.delays))
+    if arguments.trained_agent is not None:
+        model.import_parameters(arguments.trained_agent)
     return model
 
 

@@ -170,17 +170,17 @@ class ExchangeCallback(RoundCallback):
 
 
 class RoundProgressCallback(RoundCallback):
-    """A progress bar over rounds with the current client-average return of finished training episodes."""
+    """A progress bar over all rounds of a run with the current client-average return of finished training episodes."""
 
-    def __init__(self, total_timesteps: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.total_timesteps = total_timesteps
         self.bar: Any = None
 
     def _on_training_start(self) -> None:
         per_round = self.model.rollout_size * self.model.n_participants
-        remaining = max(0, self.total_timesteps - self.model.num_timesteps)
-        self.bar = tqdm(total=-(-remaining // per_round), desc=type(self.model).__name__, unit="round", dynamic_ncols=True)
+        done = self.model.round
+        total = done - (self.model.num_timesteps - self.model._total_timesteps) // per_round
+        self.bar = tqdm(total=total, initial=done, desc=type(self.model).__name__, unit="round", dynamic_ncols=True)
 
     def _on_round_end(self) -> None:
         self.bar.set_postfix({"return": f"{self.model.mean_episode_return():.1f}"}, refresh=False)

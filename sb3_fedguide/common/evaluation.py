@@ -12,12 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fed_envs import FederatedVecEnv
+from fed_envs.faults import ClientError
 from fed_envs.state import State, freeze, thaw
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.seeding import EVALUATION_SEED, Role
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
+
+#: Steps after which an episode of an evaluation is taken for one that never ends.
+MAX_STEPS = 100_000
 
 
 @dataclass(frozen=True)
@@ -26,8 +30,8 @@ class Evaluation:
 
     :param returns: undiscounted raw returns, ``(n_clients, n_episodes)``
     :param lengths: steps, ``(n_clients, n_episodes)``
-    :param successes: whether each episode succeeded, ``(n_clients, n_episodes)`` bool; ``None`` where the environments do not
-        say
+    :param successes: whether each episode succeeded, ``(n_clients, n_episodes)`` bool; ``None`` where no environment says.
+        Where only some clients' do, it is float with NaN for the others
     """
 
     returns: np.ndarray
@@ -46,8 +50,15 @@ class Evaluation:
 
     @property
     def success_rates(self) -> np.ndarray | None:
-        """Share of each client's episodes that succeeded, ``(n_clients,)``; ``None`` where the environments do not say."""
+        """Share of each client's episodes that succeeded, ``(n_clients,)``; ``None`` where no environment says, NaN where a
+        client's does not."""
         return None if self.successes is None else self.successes.mean(axis=1)
+
+    @property
+    def success_list(self) -> list[float | None] | None:
+        """:attr:`success_rates` for JSON, with ``None`` for the clients whose environments do not say."""
+        rates = self.success_rates
+        return None if rates is None else [None if np.isnan(rate) else float(rate) for rate in rates]
 
     @property
     def worst_client(self) -> float:
@@ -66,6 +77,7 @@ def evaluate_federation(
     env: FederatedVecEnv,
     seed: int = EVALUATION_SEED,
     active: np.ndarray | None = None,
+    max_steps: int = MAX_STEPS,
 ) -> Evaluation:
     """Run one seeded episode in every copy of every client's environment.
 
@@ -73,22 +85,48 @@ def evaluate_federation(
     :param env: one copy per client and episode
     :param seed: of the episodes
     :param active: ``(n_clients, n_episodes)`` bool, which of them to run; all if ``None``. Of the others nothing is known
+    :param max_steps: of an episode
+    :raises ClientError: for the clients one of whose episodes does not end before
     """
     env.seed(seed)
     env.active[:] = True if active is None else active.reshape(-1)
     obs: Any = env.reset()
     returns, lengths = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)
-    successes: dict[int, bool] = {}
-    while env.active.any():
+    shape = (env.n_clients, env.n_envs_per_client)
+    successes, say = np.zeros(env.num_envs, dtype=bool), np.zeros(env.num_envs, dtype=bool)
+    for _ in range(max_steps):
         obs, _, dones, infos = env.step(predict(obs))
         for index in np.flatnonzero(dones):
             returns[index], lengths[index] = infos[index]["episode"]["r"], infos[index]["episode"]["l"]
-            if "is_success" in infos[index]:
-                successes[int(index)] = bool(infos[index]["is_success"])
+            success = infos[index].get("is_success")
+            if success is not None:
+                say[index], successes[index] = True, _truth(success, env.client_ids[index // env.n_envs_per_client])
         env.active[dones] = False
-    shape = (env.n_clients, env.n_envs_per_client)
-    succeeded = np.array([successes.get(index, False) for index in range(env.num_envs)]).reshape(shape) if successes else None
-    return Evaluation(returns.reshape(shape), lengths.reshape(shape), succeeded)
+        if not env.active.any():
+            break
+    else:
+        waiting = [env.client_ids[position] for position in np.flatnonzero(env.active.reshape(shape).any(axis=1))]
+        raise ClientError(
+            waiting,
+            f"an episode of the evaluation has not ended after {max_steps} steps: end it yourself, or with "
+            "gymnasium.wrappers.TimeLimit, or train without evaluation",
+        )
+    return Evaluation(returns.reshape(shape), lengths.reshape(shape), _successes(successes.reshape(shape), say.reshape(shape)))
+
+
+def _truth(success: Any, client: int) -> bool:
+    try:
+        return bool(success)
+    except ValueError:
+        raise ClientError([client], f"the is_success of its environment is neither true nor false: {success!r}") from None
+
+
+def _successes(successes: np.ndarray, say: np.ndarray) -> np.ndarray | None:
+    """As :class:`Evaluation` has them. A client that says so of some episodes had no success in the others."""
+    if not say.any():
+        return None
+    silent = ~say.any(axis=1)
+    return np.where(silent[:, None], np.nan, successes) if silent.any() else successes
 
 
 class FederatedEvalCallback(RoundCallback):
@@ -102,6 +140,7 @@ class FederatedEvalCallback(RoundCallback):
     :param n_episodes: episodes per client
     :param csv_path: file to write, one row per round, client and policy; ``None`` for none
     :param deterministic: evaluate the mean action
+    :param max_steps: of an episode, as in :func:`evaluate_federation`
     """
 
     LAST_ROUNDS = 20
@@ -113,12 +152,13 @@ class FederatedEvalCallback(RoundCallback):
         n_episodes: int = 10,
         csv_path: str | Path | None = None,
         deterministic: bool = True,
+        max_steps: int = MAX_STEPS,
     ) -> None:
         super().__init__()
         if eval_freq < 1 or n_episodes < 1:
             raise ValueError(f"eval_freq={eval_freq} and n_episodes={n_episodes} must be at least 1")
         self.n_rounds, self.eval_freq, self.n_episodes, self.deterministic = n_rounds, eval_freq, n_episodes, deterministic
-        self.csv_path = None if csv_path is None else Path(csv_path)
+        self.csv_path, self.max_steps = None if csv_path is None else Path(csv_path), max_steps
         #: the last evaluation of the deployed and of the broadcast policy
         self.last: dict[str, Evaluation] = {}
 
@@ -166,9 +206,10 @@ class FederatedEvalCallback(RoundCallback):
             for client, value in zip(self.model.client_ids, evaluation.client_returns, strict=True):
                 self.model.record_client(client, "eval_mean_reward", float(value))
             if evaluation.success_rates is not None:
-                self.logger.record("eval/success_rate", float(evaluation.success_rates.mean()))
+                self.logger.record("eval/success_rate", float(np.nanmean(evaluation.success_rates)))
                 for client, value in zip(self.model.client_ids, evaluation.success_rates, strict=True):
-                    self.model.record_client(client, "eval_success_rate", float(value))
+                    if not np.isnan(value):
+                        self.model.record_client(client, "eval_success_rate", float(value))
 
     def _on_round_end(self) -> None:
         round = self.model.round
@@ -184,7 +225,9 @@ class FederatedEvalCallback(RoundCallback):
 
     def run(self) -> Evaluation:
         """The model's current policies in this callback's episodes; nothing is logged or written."""
-        return evaluate_federation(lambda obs: self.model.predict(obs, deterministic=self.deterministic)[0], self.env)
+        return evaluate_federation(
+            lambda obs: self.model.predict(obs, deterministic=self.deterministic)[0], self.env, max_steps=self.max_steps
+        )
 
     def _evaluate(self, policy: str, round: int) -> Evaluation:
         evaluation = self.run()
@@ -197,8 +240,8 @@ class FederatedEvalCallback(RoundCallback):
         return evaluation
 
     def _rows(self, policy: str, round: int, evaluation: Evaluation) -> list[tuple[Any, ...]]:
-        rates = evaluation.success_rates
-        success = [""] * len(evaluation.returns) if rates is None else [f"{rate:.6g}" for rate in rates]
+        rates = evaluation.success_list or [None] * len(evaluation.returns)
+        success = ["" if rate is None else f"{rate:.6g}" for rate in rates]
         clients = zip(self.model.client_ids, evaluation.returns, evaluation.lengths, success, strict=True)
         return [
             (round, self.model.environment_steps, policy, client, f"{r.mean():.6g}", f"{r.std():.6g}", f"{n.mean():.6g}", rate)

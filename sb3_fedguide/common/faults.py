@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -19,6 +20,16 @@ def in_round(round: int) -> Iterator[None]:
         yield
     except ClientError as error:
         raise error.in_round(round) from error.__cause__
+
+
+def warn_of_new_episodes(client_ids: Sequence[int]) -> None:
+    """Say, once for the same clients, whose episodes began anew because their environments give no state."""
+    if client_ids:
+        warnings.warn(
+            f"the environments of client{'s' if len(client_ids) > 1 else ''} {', '.join(map(str, client_ids))} give no state, "
+            "so their episodes began anew; with methods save_state() and load_state(state) they would go on exactly",
+            stacklevel=2,
+        )
 
 
 def check_experience(client_ids: Sequence[int], experience: Mapping[str, np.ndarray]) -> None:

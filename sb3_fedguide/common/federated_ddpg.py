@@ -19,9 +19,10 @@ from torch import nn
 from fed_envs import FederatedVecEnv
 from fed_envs.state import State
 from sb3_fedguide.common.ddpg_policy import BoundedActor, StackedDDPGPolicy
+from sb3_fedguide.common.environments import FederationLike, as_federated_env
 from sb3_fedguide.common.export import client_ddpg, export_program
 from sb3_fedguide.common.faults import check_experience
-from sb3_fedguide.common.federation import Federation, FederationLike, as_federated_env
+from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
 from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.participation import ParticipationAdam
@@ -271,7 +272,7 @@ class FederatedDDPG(Federation, DDPG):
                 next_obs[client, env] = info["terminal_observation"]
                 terminations[client, env] = not info.get("TimeLimit.truncated", False)
                 if "episode" in info:
-                    self.episode_infos[client].append(info["episode"])
+                    self._keep_episode(int(client), info["episode"])
         return next_obs, terminations
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -340,6 +341,12 @@ class FederatedDDPG(Federation, DDPG):
         actor: Any = self.client(client_id).policy.actor
         policy = nn.Sequential(actor.features_extractor, BoundedActor(actor.mu, self.action_space))  # type: ignore[arg-type]
         export_program(policy, self.observation_space.shape[0], path)  # type: ignore[index]
+
+    def begin_lost_episodes(self) -> list[int]:
+        ended = self._federated_env().lost
+        clients = super().begin_lost_episodes()
+        self.noise.reset(ended.reshape(self.n_clients, self.n_envs_per_client))
+        return clients
 
     def save_state(self) -> State:
         assert self.replay_buffer is not None

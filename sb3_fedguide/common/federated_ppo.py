@@ -18,8 +18,9 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide.common import gaussian
+from sb3_fedguide.common.environments import FederationLike, as_federated_env
 from sb3_fedguide.common.faults import check_experience
-from sb3_fedguide.common.federation import Federation, FederationLike, PolicyLike, as_federated_env
+from sb3_fedguide.common.federation import Federation, PolicyLike
 from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
@@ -250,7 +251,7 @@ class FederatedPPO(Federation, PPO):
     def _end_episode(self, index: int, info: dict[str, Any]) -> None:
         client, env = divmod(index, self.n_envs_per_client)
         if "episode" in info:
-            self.episode_infos[client].append(info["episode"])
+            self._keep_episode(client, info["episode"])
         if info.get("TimeLimit.truncated", False):
             final = np.asarray(info["terminal_observation"])
             self.rollout_buffer.add_truncation(client, env, final, self.normalizer.normalize_obs(final, client))

@@ -5,11 +5,10 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3 import DDPG, PPO
@@ -23,9 +22,11 @@ from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback, RoundProgressCallback, round_callbacks
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
+from sb3_fedguide.common.environments import FederationLike as FederationLike
+from sb3_fedguide.common.environments import as_federated_env
 from sb3_fedguide.common.exchange import Exchange
 from sb3_fedguide.common.export import client_model, export_client
-from sb3_fedguide.common.faults import check_policies, in_round
+from sb3_fedguide.common.faults import check_policies, in_round, warn_of_new_episodes
 from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize, check_normalize
 from sb3_fedguide.common.parameters import ParameterFiles
 from sb3_fedguide.common.participation import ParticipationAdam
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from sb3_fedguide.engines.engine import Engine
 
 PolicyLike = str | type[ActorCriticPolicy]
-FederationLike = str | Path | Any | Sequence[Callable[[], gym.Env]]
 SelfFederation = TypeVar("SelfFederation", bound="Federation")
 
 
@@ -57,6 +57,8 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
     normalizer: FederatedNormalizer
     rollout_size: int
     gamma: float
+    #: of each client's last finished episodes: return, length, seconds
+    episode_infos: list[deque[dict[str, float]]]
 
     def _init_federation(
         self,
@@ -215,7 +217,7 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
         with in_round(1 if reset_num_timesteps else self.round + 1):
             total_timesteps, callbacks = self._setup_learn(
                 total_timesteps,
-                self._round_callbacks(callback, total_timesteps, progress_bar),
+                self._round_callbacks(callback, progress_bar),
                 reset_num_timesteps,
                 tb_log_name or type(self).__name__,
             )
@@ -232,6 +234,8 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
         self._draw_participants()
         for hook in rounds:
             hook.on_round_start()
+        if self.engine is None:
+            warn_of_new_episodes(self.begin_lost_episodes())
         if not (self.train_locally(callbacks) if self.engine is None else self.engine.train_round(self, callbacks)):
             return False
         check_policies(self.client_ids, self.policy)
@@ -265,14 +269,14 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
     def _train_round(self, callbacks: BaseCallback) -> bool:
         """One round's experience and gradient steps of those present; false where a callback ended the training."""
 
-    def _round_callbacks(self, callback: MaybeCallback, total_timesteps: int, progress_bar: bool) -> CallbackList:
+    def _round_callbacks(self, callback: MaybeCallback, progress_bar: bool) -> CallbackList:
         """The exchange first, then the user's callbacks, which see its result, then the progress bar."""
         chain: list[BaseCallback] = [ExchangeCallback()]
         for item in callback if isinstance(callback, list) else [callback]:
             if item is not None:
                 chain.append(item if isinstance(item, BaseCallback) else ConvertCallback(item))
         if progress_bar:
-            chain.append(RoundProgressCallback(total_timesteps))
+            chain.append(RoundProgressCallback())
         return CallbackList(chain)
 
     def _begin_learning(self, environments_were_reset: bool) -> None:
@@ -280,9 +284,11 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
             self.normalizer.reset_returns()
             self.normalizer.update_obs(self._last_obs.reshape(self.n_clients, self.n_envs_per_client, -1))  # type: ignore
         if environments_were_reset or not hasattr(self, "episode_infos"):
-            self.episode_infos: list[deque[dict[str, float]]] = [
-                deque(maxlen=self._stats_window_size) for _ in range(self.n_clients)
-            ]
+            self.episode_infos = [deque(maxlen=self._stats_window_size) for _ in range(self.n_clients)]
+
+    def _keep_episode(self, client: int, episode: dict[str, Any]) -> None:
+        """Keep a finished episode's figures; what else an environment says of it may be anything."""
+        self.episode_infos[client].append({name: episode[name] for name in ("r", "l", "t")})
 
     def mean_episode_return(self) -> float:
         """Average over clients of each one's mean return over its last finished training episodes."""
@@ -356,23 +362,3 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "normalizer"], []
-
-
-def as_federated_env(
-    env: FederationLike | None,
-    n_envs_per_client: int = 1,
-    clients: Sequence[int] | None = None,
-    num_threads: int = 1,
-) -> FederatedVecEnv | None:
-    """A ``FederatedVecEnv`` from a family name, metadata file, ``Family`` or list of factories.
-
-    :raises ValueError: for an environment that holds a single client
-    """
-    if env is None or isinstance(env, FederatedVecEnv):
-        return env
-    if isinstance(env, VecEnv | gym.Env):
-        raise ValueError(
-            f"a federation needs one environment per client, but got a single {type(env).__name__}; pass a family name, "
-            "a metadata file, a fed_envs.FederatedVecEnv or a list of environment factories"
-        )
-    return FederatedVecEnv(env, n_envs_per_client=n_envs_per_client, clients=clients, num_threads=num_threads)

@@ -111,6 +111,18 @@ class Resumable(BaseAlgorithm):
         th.set_rng_state(th.from_numpy(state["random"]["torch"].copy()))
         np.random.set_state(thaw(state["random"]["numpy"]))
 
+    def begin_lost_episodes(self) -> list[int]:
+        """Begin new episodes where :meth:`load_state` found environments that cannot be put back to where they stood.
+
+        :return: the clients that lost an episode by it
+        """
+        rows, observations, clients = self._federated_env().begin_lost_episodes()
+        if len(rows):
+            assert self._last_obs is not None and self._last_episode_starts is not None
+            self._last_obs[rows], self._last_episode_starts[rows] = observations, True  # type: ignore[call-overload]
+            self.normalizer.returns.reshape(-1)[rows] = 0.0
+        return clients
+
     def resume(self: SelfResumable, folder: str | Path) -> SelfResumable:
         """Take the newest intact checkpoint that a :class:`CheckpointCallback` wrote to ``folder``.
 

@@ -53,6 +53,16 @@ class WarmStart(BaseAlgorithm):
             trunk=trunk,
         )
 
+    def check_offline_data(self) -> None:
+        """:raises ValueError: where the offline stage needs data and none can be had, before anything is computed"""
+        if self.pretrained or not (self.uses_prior or self.bc_weight > 0):
+            return
+        try:
+            self.offline_stage().check_data()
+        except ValueError as error:
+            remedy = "" if self.uses_prior else "; or leave behaviour cloning out with bc_weight=0 (-params bc_weight:0)"
+            raise ValueError(f"{type(self).__name__} begins with an offline stage: {error}{remedy}") from None
+
     def pretrain(self, progress_bar: bool = False, trunk: Payload | None = None) -> None:
         """The offline stage: behaviour cloning and whatever the method needs; results are cached. Runs at most once.
 
@@ -62,6 +72,7 @@ class WarmStart(BaseAlgorithm):
         """
         if self.pretrained:
             return
+        self.check_offline_data()
         stage = self.offline_stage(progress_bar, trunk)
         if self.bc_weight > 0:
             self._initialize_from_behavior_cloning(stage)

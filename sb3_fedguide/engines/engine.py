@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Event
 from fed_envs.faults import ClientError
 from fed_envs.state import State
 from sb3_fedguide.common.callbacks import RoundCallback
+from sb3_fedguide.common.faults import warn_of_new_episodes
 from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.engines.client_axis import join_clients, take_clients
 from sb3_fedguide.engines.worker import Round, Trained, describe
@@ -24,8 +25,8 @@ class EngineError(RuntimeError):
 class Engine(ABC):
     """Divides the clients into groups that train at the same time; server, evaluation and log stay where they are.
 
-    Workers keep nothing between rounds: each round, a group's state goes to its worker and comes back trained. So a run has
-    the same results, checkpoints and files with every engine and any number of workers.
+    Workers keep nothing between rounds, but environments that give no state: each round, a group's state goes to its worker
+    and comes back trained. So a run has the same results, checkpoints and files with every engine and any number of workers.
 
         with Processes(2) as engine:
             engine.attach(model)
@@ -113,6 +114,7 @@ class Engine(ABC):
             if reply.observations is not None:
                 model.rollout_buffer.observations[:, self.groups[k]] = reply.observations  # type: ignore[attr-defined]
         self._record(model, replies)
+        warn_of_new_episodes(sorted(client for reply in replies.values() for client in reply.restarted))
         callbacks.on_rollout_end()
         return True
 

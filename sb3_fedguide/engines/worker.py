@@ -36,16 +36,20 @@ class Trained(NamedTuple):
 
     :param state: of its clients, after the round
     :param figures: what was logged, with the outputs that each value is kept from
+    :param restarted: clients whose episodes had to begin anew
     :param observations: what the actors saw, ``(n_steps, n_clients, n_envs, obs_dim)``; ``None`` off policy
     """
 
     state: State
     figures: dict[str, tuple[float, Any]]
     observations: np.ndarray | None
+    restarted: list[int]
 
 
 class Worker:
-    """Keeps nothing between two rounds: any worker can go on with any group's state.
+    """Keeps nothing between two rounds but environments that give no state: any worker can go on with any group's state.
+
+    In a worker that has not stepped them, such environments begin new episodes.
 
     :param blob: what :func:`describe` returned for its clients
     """
@@ -77,13 +81,14 @@ class Worker:
         model.take_part(model.present)
         model._total_timesteps, model.steps_at_once = round.total_timesteps, round.steps_at_once
         try:
+            restarted = model.begin_lost_episodes()
             model.train_locally(self.callbacks)
         except ClientError as error:
             return error
         excluded = model.logger.name_to_excluded
         figures = {key: (value, excluded[key]) for key, value in model.logger.name_to_value.items()}
         buffer = getattr(model, "rollout_buffer", None)
-        return Trained(model.save_state(), figures, None if buffer is None else buffer.observations)
+        return Trained(model.save_state(), figures, None if buffer is None else buffer.observations, restarted)
 
 
 def describe(model: Federation, positions: Sequence[int]) -> bytes:

@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Mapping
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 
 from fed_envs.files import atomic_file
@@ -141,8 +142,12 @@ def behavior_policy(backbone: str, noise_scale: float = 1.0) -> BehaviorPolicy:
     path = POLICY_FOLDER / f"{backbone.split('-')[0]}.npz"
     if not path.exists():
         shipped = sorted(file.stem for file in POLICY_FOLDER.glob("*.npz"))
+        trained = ""
+        if backbone in gymnasium.registry:
+            trained = f", or train one with `python -m sb3_fedguide.offline.train_behavior --env {backbone} --target RETURN`"
         raise ValueError(
-            f"no behaviour policy for {backbone!r} (shipped: {shipped}); train one with "
-            f"`python -m sb3_fedguide.offline.train_behavior --env {backbone}` or pass your own data with dataset="
+            f"no behaviour policy for {backbone!r} (shipped: {', '.join(shipped)}): give the world's class a "
+            "scripted_policy (docs/extending.md), or a Minari dataset with --dataset ID_OR_PATH, in Python "
+            f"pretraining={{'dataset': 'ID_OR_PATH'}}{trained}"
         )
     return BehaviorPolicy.load(path, noise_scale)

@@ -15,7 +15,7 @@ from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.behavior import BehaviorPolicy, behavior_policy
 from sb3_fedguide.offline.data import OfflineData
 
-__all__ = ["DATA_VERSION", "behavior_name", "collect", "default_size", "source_key"]
+__all__ = ["DATA_VERSION", "behavior_name", "check_source", "collect", "default_size", "source_key"]
 
 DATA_VERSION = 1
 """Raised whenever the same inputs give other data, so that old cache entries are not taken for new ones."""
@@ -47,6 +47,18 @@ def source_key(family: Family, client: int, policy: BehaviorPolicy | None = None
         "copies": N_COPIES,
         **source,
     }
+
+
+def check_source(family: Family, client: int) -> None:
+    """:raises ValueError: where nothing is known that could make the client's data"""
+    if family.world == "gymnasium":
+        raise ValueError(
+            f"{family.client(client).id} brings no offline data: give a Minari dataset with --dataset ID_OR_PATH, in Python "  # type: ignore[attr-defined]
+            "pretraining={'dataset': 'ID_OR_PATH'} ({client} in it stands for the client's number); `fedguide dataset` makes "
+            "one from logs"
+        )
+    if environment_class(family.world).scripted_policy(family, client) is None:
+        behavior_policy(family.backbone)
 
 
 def behavior_name(family: Family, client: int, policy: BehaviorPolicy | None = None) -> str:

@@ -64,8 +64,8 @@ def client_datasets(
     known = None if family is None else load_family(family)
     if known is None and (dataset is None or clients is None or env_spaces is None):
         raise ValueError(
-            "environments of one's own have no behaviour policy: pass dataset= with a Minari dataset (an id or a path, "
-            "{client} in it stands for the client's number), clients= and env_spaces="
+            "environments of one's own bring no offline data: client_datasets() needs dataset= (an id or a path, {client} in "
+            "it stands for the client's number), clients= and env_spaces="
         )
     clients = range(known.n_clients) if clients is None and known is not None else clients or ()
     for client in clients if known is not None else ():

@@ -18,7 +18,7 @@ from minari.serialization import deserialize_space
 
 from sb3_fedguide.offline.data import OfflineData
 
-__all__ = ["check_spaces", "find_dataset", "read_minari", "write_minari"]
+__all__ = ["check_spaces", "find_dataset", "local_root", "read_minari", "write_minari"]
 
 
 def write_minari(
@@ -94,7 +94,7 @@ def find_dataset(dataset: str) -> Path:
 
     :raises ValueError: if there is none; the message lists the local ones
     """
-    root = _local_root()
+    root = local_root()
     try:
         path = Path(dataset).expanduser()
         for candidate in (path, path / "data", root / dataset / "data"):
@@ -109,7 +109,7 @@ def find_dataset(dataset: str) -> Path:
     )
 
 
-def _local_root() -> Path:
+def local_root() -> Path:
     """Where Minari keeps its datasets. Its own functions would make the folder, and import the environment of a dataset."""
     return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
 

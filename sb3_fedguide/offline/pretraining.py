@@ -25,6 +25,7 @@ from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.common.stacked import to_tensors
 from sb3_fedguide.offline.behavior_cloning import clone
 from sb3_fedguide.offline.cache import arrays_hash, cache_folder, cached_arrays, content_key, keep_arrays
+from sb3_fedguide.offline.collect import check_source
 from sb3_fedguide.offline.config import Piece, PretrainingConfig
 from sb3_fedguide.offline.datasets import OfflineData, client_datasets, normalize_observations
 from sb3_fedguide.offline.dice import DiceValue, train_dice
@@ -100,6 +101,19 @@ class Pretraining:
         self._trunk: tuple[Prior, int, int] | None = None
         self._given_trunk = trunk
 
+    def check_data(self) -> None:
+        """:raises ValueError: where no offline data can be had, before anything is computed"""
+        if self.config.dataset is not None:
+            return
+        if self.family is None:
+            raise ValueError(
+                "environments of your own bring no offline data: give a Minari dataset, pretraining={'dataset': "
+                "'robots/arm{client}-v0'} (an id or a path; {client} stands for the client's number). `fedguide dataset` and "
+                "sb3_fedguide.offline.make_dataset make one from logs and arrays (docs/extending.md)"
+            )
+        for client in self.client_ids:
+            check_source(self.family, client)
+
     def datasets(self, client_ids: Sequence[int] | None = None) -> list[OfflineData]:
         """Offline data of the clients that live here, or of ``client_ids``.
 
@@ -107,6 +121,7 @@ class Pretraining:
         """
         wanted = self.client_ids if client_ids is None else list(client_ids)
         missing = [client for client in wanted if client not in self._data]
+        self.check_data()
         if missing:
             data = client_datasets(
                 self.family,

@@ -1,0 +1,207 @@
+"""Environments of the user's own: how they are made, checked and stepped, and what of them a checkpoint can hold."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common import monitor
+from stable_baselines3.common.monitor import Monitor
+
+from fed_envs.faults import ClientError, ContractError, RowError
+from fed_envs.state import State, gives_state
+from fed_envs.world import Batch, Runner, run_here
+
+EnvFactory = Callable[[], gymnasium.Env]
+
+_STEP = "(observation, reward, terminated, truncated, info)"
+
+
+class FactoryBatch(Batch[Any]):
+    """Environments of the user's own, stepped one by one; their truncations are theirs to say."""
+
+    def __init__(self, envs: Sequence[gymnasium.Env]) -> None:
+        super().__init__(envs)  # type: ignore[arg-type]
+        self._infos: list[dict[str, Any]] = [{} for _ in envs]
+
+    def step(self, actions: np.ndarray, rows: Sequence[int], run: Runner = run_here) -> None:
+        row, shape = -1, self.observations.shape[1:]
+        try:
+            for row in rows:
+                result = check_step(self.envs[row].step(actions[row]), shape)
+                self.observations[row], reward, terminated, truncated, self._infos[row] = result
+                self.rewards[row], self.terminated[row] = _scalar(reward), _scalar(terminated)
+                self.truncated[row] = _scalar(truncated)
+        except Exception as error:
+            raise RowError(row) from error
+
+    def info(self, row: int) -> dict[str, Any]:
+        return dict(self._infos[row])
+
+    def infos(self) -> list[dict[str, Any]]:
+        return [dict(info) for info in self._infos]
+
+
+class Positions:
+    """Where environments stand that give no state of their own: how they were last seeded, and the moves since then.
+
+    :param envs: all environments; of those that give their state nothing is noted
+    """
+
+    def __init__(self, envs: Sequence[gymnasium.Env]) -> None:
+        #: which environments these are, ``(num_envs,)`` bool
+        self.ordinary = np.array([not gives_state(env) for env in envs], dtype=bool)
+        #: of them, those that are not where they are said to be
+        self.lost = np.zeros(len(envs), dtype=bool)
+        self.seeds: list[int | None] = [None] * len(envs)
+        #: steps since the environment was seeded
+        self.moves = np.zeros(len(envs), dtype=np.int64)
+
+    def reset(self, row: int, seed: int | None) -> None:
+        """The environment in ``row`` was reset, from outside and not at an episode's end."""
+        self.lost[row] = False
+        self.seeds[row], self.moves[row] = (self.seeds[row], self.moves[row] + 1) if seed is None else (seed, 0)
+
+    def save(self, row: int) -> State:
+        return {"seed": self.seeds[row], "moves": int(self.moves[row])}
+
+    def load(self, row: int, state: State, is_the_same: bool) -> None:
+        """:param is_the_same: whether observation and episode are what the state says"""
+        here = is_the_same and not self.lost[row] and self.save(row) == state
+        self.seeds[row], self.moves[row], self.lost[row] = state["seed"], state["moves"], not here
+
+
+def make_envs(factories: Sequence[EnvFactory], client_ids: Sequence[int], n_copies: int) -> list[gymnasium.Env]:
+    """Call each client's function once for each of its copies.
+
+    :raises ClientError: where a function raises, or returns something else than a new environment
+    """
+    envs: list[gymnasium.Env] = []
+    for client in client_ids:
+        for _ in range(n_copies):
+            try:
+                env = factories[client]()
+            except Exception as error:
+                hint = "; it is called without arguments: bind them with functools.partial" if _lacks_argument(error) else ""
+                reason = f"the function that makes its environment raised {type(error).__name__}: {error}{hint}"
+                raise ClientError([client], reason) from error
+            if not isinstance(env, gymnasium.Env):
+                hint = "; of a VecEnv, give the function of one environment" if hasattr(env, "num_envs") else ""
+                reason = f"the function that makes its environment returned a {type(env).__name__}, which is no gymnasium.Env"
+                raise ClientError([client], reason + hint)
+            envs.append(env)
+    if len({id(env.unwrapped) for env in envs}) != len(envs):
+        raise ValueError("each function must return a new environment at every call, not the same one again")
+    return envs
+
+
+def check_spaces(envs: Sequence[gymnasium.Env], client_ids: Sequence[int]) -> None:
+    """:raises ValueError: for environments that cannot be trained together"""
+    n_copies, first = len(envs) // len(client_ids), envs[0]
+    for row, env in enumerate(envs):
+        for kind in ("observation_space", "action_space"):
+            if not isinstance(getattr(env, kind, None), spaces.Space):
+                raise ClientError([client_ids[row // n_copies]], f"its environment has no {kind}; set it in the constructor")
+    if not isinstance(first.observation_space, spaces.Box) or len(first.observation_space.shape) != 1:
+        raise ValueError(
+            f"observations must be a Box of one dimension, got {first.observation_space}; "
+            "flatten others with gymnasium.wrappers.FlattenObservation"
+        )
+    for row, env in enumerate(envs):
+        for kind in ("observation_space", "action_space"):
+            if getattr(env, kind) != getattr(first, kind):
+                raise ValueError(
+                    f"all clients must share their spaces: client {client_ids[row // n_copies]} has {kind} "
+                    f"{getattr(env, kind)}, client {client_ids[0]} has {getattr(first, kind)}"
+                )
+
+
+def check_monitor_files(envs: Sequence[gymnasium.Env], client_ids: Sequence[int]) -> None:
+    """:raises ValueError: where two environments' ``Monitor`` write to one file"""
+    n_copies = len(envs) // len(client_ids)
+    owners: dict[str, int] = {}
+    for row, env in enumerate(envs):
+        client = client_ids[row // n_copies]
+        while isinstance(env, gymnasium.Wrapper):
+            if isinstance(env, Monitor) and env.results_writer is not None:
+                path = os.path.realpath(env.results_writer.file_handler.name)
+                if path in owners:
+                    raise ValueError(
+                        f"Monitor of client {client} writes to {path}, and so does that of client {owners[path]}: give each a "
+                        "name of its own, or none (a function is called once for each of n_envs_per_client)"
+                    )
+                owners[path] = client
+            env = env.env
+
+
+@contextmanager
+def monitors_without_files() -> Iterator[None]:
+    """Every ``Monitor`` that is made meanwhile writes no file: a function that is called again would overwrite the first's."""
+    before = monitor.ResultsWriter
+    monitor.ResultsWriter = lambda *args, **kwargs: None  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        monitor.ResultsWriter = before  # type: ignore[misc]
+
+
+def check_shape(observation: Any, shape: tuple[int, ...]) -> None:
+    """:raises ValueError: for an observation of another shape, which NumPy may stretch without a word"""
+    if np.shape(observation) != shape:
+        raise ValueError(f"the observation has the shape {np.shape(observation)}, the observation space {shape}")
+
+
+def check_step(result: Any, shape: tuple[int, ...]) -> Any:
+    """What a step returned, as it is.
+
+    :raises ContractError: where that is something else than Gymnasium's five values
+    """
+    if not isinstance(result, (tuple, list)) or len(result) != 5 or not isinstance(result[4], dict):
+        raise ContractError(f"has to return {_STEP}, as in Gymnasium, and returned {_described(result)}")
+    check_shape(result[0], shape)
+    return result
+
+
+def reset_env(env: gymnasium.Env, seed: int | None, options: dict[str, Any] | None, shape: tuple[int, ...]) -> Any:
+    """Reset an environment as Stable-Baselines3 does: what is not given is not passed.
+
+    :return: observation and info
+    :raises ContractError: where it returns something else
+    """
+    given: dict[str, Any] = {**({} if seed is None else {"seed": seed}), **({"options": options} if options else {})}
+    result = env.reset(**given)
+    if not isinstance(result, (tuple, list)) or len(result) != 2 or not isinstance(result[1], dict):
+        raise ContractError(f"has to return (observation, info), as in Gymnasium, and returned {_described(result)}")
+    check_shape(result[0], shape)
+    return result
+
+
+def own_record(info: dict[str, Any], episode: dict[str, Any]) -> dict[str, Any]:
+    """What an environment's own ``Monitor`` or ``RecordEpisodeStatistics`` says of its episode, else ``episode``."""
+    theirs = info.get("episode")
+    if not isinstance(theirs, dict):
+        return episode
+    try:
+        return {**theirs, "r": float(theirs["r"]), "l": int(theirs["l"]), "t": float(theirs.get("t", episode["t"]))}
+    except (TypeError, KeyError, ValueError):
+        return episode
+
+
+def _scalar(value: Any) -> Any:
+    """A number by itself where an environment has it in an array."""
+    return value.item() if isinstance(value, np.ndarray) else value
+
+
+def _described(result: Any) -> str:
+    if not isinstance(result, (tuple, list)):
+        return f"a {type(result).__name__}"
+    return f"{len(result)} values ({', '.join(type(value).__name__ for value in result)})"
+
+
+def _lacks_argument(error: Exception) -> bool:
+    return isinstance(error, TypeError) and "required positional argument" in str(error)
