@@ -12,7 +12,14 @@ from sb3_fedguide.common.screening import LONGEST_WAIT, clearly_better
 from sb3_fedguide.server.payload import N_SAMPLES
 from tests.conftest import assert_same_parameters, parameters_of
 
-SCREENED = {"rollout_size": 128, "batch_size": 64, "n_epochs": 1, "seed": 3, "policy_kwargs": {"net_arch": [8]}, "screening": 0.5}
+SCREENED = {
+    "rollout_size": 128,
+    "batch_size": 64,
+    "n_epochs": 1,
+    "seed": 3,
+    "policy_kwargs": {"net_arch": [8]},
+    "screening": 0.5,
+}
 
 
 def steady(model: FedAvg, action: float) -> dict[str, np.ndarray]:
@@ -96,7 +103,8 @@ def test_tests_cost_no_more_than_their_share_and_are_counted(point_envs, tmp_pat
 
 def test_tests_disturb_nothing(point_envs):
     plain, tested = (
-        FedAvg("MlpPolicy", point_envs(3), **{**SCREENED, "screening": screening}).learn(3 * 3 * 128) for screening in (0.0, 0.5)
+        FedAvg("MlpPolicy", point_envs(3), **{**SCREENED, "screening": screening}).learn(3 * 3 * 128)
+        for screening in (0.0, 0.5)
     )
     assert tested.test_steps > 0 and not tested.screening_state["alone"].any()
     for client in range(3):
@@ -116,7 +124,13 @@ def test_a_client_that_leaves_moves_nobody(point_envs):
 
 def test_off_policy_clients_test_too(point_envs):
     model = FedRL(
-        "MlpPolicy", point_envs(2), rollout_size=128, learning_starts=64, seed=1, screening=0.5, policy_kwargs={"net_arch": [8]}
+        "MlpPolicy",
+        point_envs(2),
+        rollout_size=128,
+        learning_starts=64,
+        seed=1,
+        screening=0.5,
+        policy_kwargs={"net_arch": [8]},
     )
     model.learn(4 * 2 * 128)
     assert model.test_steps > 0

@@ -46,7 +46,9 @@ class Record(RoundCallback):
 
     def _on_local_training_end(self) -> None:
         buffer = self.model.rollout_buffer
-        raw = buffer.raw_observations.reshape(-1, self.model.n_clients, self.model.n_envs_per_client, buffer.raw_observations.shape[-1])
+        raw = buffer.raw_observations.reshape(
+            -1, self.model.n_clients, self.model.n_envs_per_client, buffer.raw_observations.shape[-1]
+        )
         last = self.model._last_obs.reshape(1, *raw.shape[1:])
         self.seen.append(np.concatenate([raw[1:], last])[:, self.model.present].copy())
 
@@ -191,8 +193,8 @@ def test_a_robust_aggregator_holds_for_statistics_too():
 
 @pytest.mark.parametrize("wrong", [
     {OBSERVATION_VAR: np.array([-1.0, 1.0])}, {OBSERVATION_MEAN: np.array([np.nan, 0.0])},
-    {OBSERVATION_MEAN: np.zeros(2, dtype=np.float32)}, {OBSERVATION_COUNT: np.array(-5.0)}, {OBSERVATION_COUNT: np.array(1e12)},
-    {OBSERVATION_MEAN: np.array([1e9, 0.0])}, {OBSERVATION_VAR: np.zeros(3)},
+    {OBSERVATION_MEAN: np.zeros(2, dtype=np.float32)}, {OBSERVATION_COUNT: np.array(-5.0)},
+    {OBSERVATION_COUNT: np.array(1e12)}, {OBSERVATION_MEAN: np.array([1e9, 0.0])}, {OBSERVATION_VAR: np.zeros(3)},
 ])  # fmt: skip
 def test_broken_statistics_are_rejected(wrong):
     rng = np.random.default_rng(4)

@@ -102,7 +102,7 @@ class FederatedNormalizer:
                 self.round_obs.update(obs.astype(np.float64), present)
 
     def begin_round(self, present: np.ndarray) -> None:
-        """Forget the last round's moments of the clients ``present``, ``(n_clients,)`` bool: they were uploaded or are lost."""
+        """Forget the last round's moments of the clients ``present``, ``(n_clients,)`` bool: they are uploaded, or lost."""
         for moments in (self.round_obs.mean, self.round_obs.count):
             moments[present] = 0.0
         self.round_obs.var[present] = 0.0

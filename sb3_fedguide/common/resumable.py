@@ -36,7 +36,8 @@ class Resumable(BaseAlgorithm):
     #: classes are added
     state_attributes: ClassVar[tuple[str, ...]] = (
         "seed", "num_timesteps", "round", "_n_updates", "_episode_num", "_current_progress_remaining", "pretrained",
-        "pretraining_bytes", "present", "outdated", "has_trained", "test_steps", "episode_infos", "_streams", "_last_obs", "_last_episode_starts",
+        "pretraining_bytes", "present", "outdated", "has_trained", "test_steps", "episode_infos", "_streams", "_last_obs",
+        "_last_episode_starts",
     )  # fmt: skip
     #: entries of the state without one entry per client, as paths (``"modules.prior"``); those of base classes are added
     shared_state: ClassVar[tuple[str, ...]] = ("identity", "random", "strategy")

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 #: Episodes of either policy in a test, where there are steps for so many.
 EPISODES = 5
-#: How much worse a policy has to test to be left, and how much better to be taken again, in what the client's returns measure.
-LEAVE, RETURN = 0.3, 0.1
+#: How much better a policy has to test, in what the client's returns measure.
+MARGIN = 0.1
 #: The first test comes after this round; between two tests lie at most so many.
-FIRST_ROUND, LONGEST_WAIT = 2, 16
+FIRST_ROUND, LONGEST_WAIT = 1, 16
 #: Part of the steps that are left for tests which one test may take.
 PART = 0.25
 
@@ -69,10 +69,8 @@ class Screening:
         for index, (own, other) in self._test(candidates, episodes).items():
             scale = self._scale(index, own)
             alone = bool(state["alone"][index])
-            if alone:
-                changes = clearly_better(other, own, RETURN * scale)
-            else:
-                changes = clearly_better(own, other, LEAVE * scale)
+            better, worse = (other, own) if alone else (own, other)
+            changes = clearly_better(better, worse, MARGIN * scale)
             state["alone"][index] = alone != changes
             state["wait"][index] = 1 if changes else min(2 * state["wait"][index], LONGEST_WAIT)
             state["next_round"][index] = model.round + state["wait"][index]

@@ -67,7 +67,9 @@ class Site:
                 "a folder of its own for each of them"
             )
         if not model.is_federated:
-            raise ValueError(f"{type(model).__name__} has all clients' data in one place and cannot be deployed to their machines")
+            raise ValueError(
+                f"{type(model).__name__} has all clients' data in one place and cannot be deployed to their machines"
+            )
         self.model, self.n_rounds, self.folder = model, n_rounds, Path(folder)
         self.client_id = model.client_ids[0]
         model.strategy = None  # it is on the server

@@ -66,7 +66,9 @@ def fedexp_step(latest: Payload, uploads: Mapping[int, Payload], change: Payload
     counts = {client: float(payload[N_SAMPLES]) for client, payload in uploads.items()}
     total = sum(counts.values())
     lengths = sum(
-        counts[client] / total * _squared_norm({name: uploads[client][name] - latest[name].astype(np.float64) for name in change})
+        counts[client]
+        / total
+        * _squared_norm({name: uploads[client][name] - latest[name].astype(np.float64) for name in change})
         for client in sorted(uploads)
     )
     return max(1.0, lengths / (2 * (_squared_norm(change) + epsilon)))
@@ -111,7 +113,9 @@ def check_aggregator(aggregator: str, trim_fraction: float) -> None:
 def check_server_step(server_step: float | str, server_momentum: float) -> None:
     """:raises ValueError: for a step that is neither positive nor ``"exp"``, or a momentum outside [0, 1)"""
     if server_step != "exp" and (isinstance(server_step, str) or not 0 < server_step < math.inf):
-        raise ValueError(f"server_step={server_step!r} must be a positive number, or 'exp' for FedExP's; 1 is the average itself")
+        raise ValueError(
+            f"server_step={server_step!r} must be a positive number, or 'exp' for FedExP's; 1 is the average itself"
+        )
     if not 0 <= server_momentum < 1:
         raise ValueError(f"server_momentum={server_momentum} must lie in [0, 1): it is what is kept of the last update")
 
@@ -168,11 +172,7 @@ class Averaging(Strategy):
     def aggregate(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:
         self.metrics = {}
         taking_part = {client: payload for client, payload in uploads.items() if payload.get(N_SAMPLES, 1) > 0}
-        names = [
-            name
-            for name in next(iter(taking_part.values()), {})
-            if name != N_SAMPLES and name.startswith(self.prefixes)
-        ]
+        names = [name for name in next(iter(taking_part.values()), {}) if name != N_SAMPLES and name.startswith(self.prefixes)]
         if not self.is_due(round) or not names:
             return {client: {} for client in uploads}
         average = self._combine(taking_part, names)

@@ -11,7 +11,6 @@ from sb3_fedguide.server.averaging import Aggregator, check_aggregator, robust_m
 from sb3_fedguide.server.payload import OBSERVATION_COUNT, OBSERVATION_MEAN, OBSERVATION_VAR, Payload
 from sb3_fedguide.server.strategy import Strategy
 
-
 #: Weight of mean 0 and variance 1 before anything is known, as in SB3's ``RunningMeanStd``.
 START_COUNT = 1e-4
 
@@ -45,8 +44,9 @@ class ObservationMoments(Strategy):
     """Pools the clients' observation statistics: ``normalize="shared"``.
 
     A client uploads count, mean and variance of its last round's raw observations, and receives those of all observations
-    that all clients have uploaded since the beginning: with the mean as aggregator they are exact, and do not depend on the
-    order in which uploads come, but for :data:`START_COUNT`. Before the first round one exchange pools what the clients know from their offline data.
+    that all clients have uploaded since the beginning. With the mean as aggregator they are exact, but for
+    :data:`START_COUNT`, and do not depend on the order in which uploads come. Before the first round one exchange pools what
+    the clients know from their offline data.
 
     :param aggregator: what takes the place of the pooled mean and variance of a round: by coordinate the median or trimmed
         mean of the clients' means, and of their mean squared distances from it
