@@ -72,7 +72,9 @@ class FedGuide(FederatedPPO):
     uses_prior = True
     server_method = "fedguide"
     uses_dice: ClassVar[bool] = True
-    state_attributes = ("heads", "score_moments", "experts", "mixture_rows", "dice_scale", "calibrated")
+    state_attributes: ClassVar[tuple[str, ...]] = (
+        "heads", "score_moments", "experts", "mixture_rows", "dice_scale", "calibrated",
+    )  # fmt: skip
     shared_state = ("parts", "modules.prior")
 
     def __init__(

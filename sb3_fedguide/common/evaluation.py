@@ -125,7 +125,7 @@ def _successes(successes: np.ndarray, say: np.ndarray) -> np.ndarray | None:
     """As :class:`Evaluation` has them. A client that says so of some episodes had no success in the others."""
     if not say.any():
         return None
-    silent = ~say.any(axis=1)
+    silent = np.logical_not(say.any(axis=1))
     return np.where(silent[:, None], np.nan, successes) if silent.any() else successes
 
 

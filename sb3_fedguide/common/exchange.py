@@ -25,7 +25,7 @@ class Exchange(BaseAlgorithm):
     strategy: Strategy | None
     upload_bound: float | None
     normalizer: FederatedNormalizer
-    n_clients: int
+    client_ids: list[int]
 
     def sends_policy(self, round: int) -> bool:
         """Whether the exchange after round ``round`` replaces the clients' policies; what it sent is evaluated as well."""
@@ -41,7 +41,7 @@ class Exchange(BaseAlgorithm):
     def _make_strategy(self) -> Strategy | None:
         """The server's side of this method; ``None`` where nothing is exchanged."""
         assert self.seed is not None
-        return make_strategy(self.server_method, self.server_settings(), self.n_clients, self.seed)
+        return make_strategy(self.server_method, self.server_settings(), len(self.client_ids), self.seed)
 
     def server_settings(self) -> dict[str, Any]:
         """What the server of this method has to know, by the names of the constructor's parameters."""

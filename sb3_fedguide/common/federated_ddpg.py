@@ -79,7 +79,7 @@ class FederatedDDPG(Federation, DDPG):
     replay_buffer: FederatedReplayBuffer | None  # type: ignore[assignment]
     policy: StackedDDPGPolicy
     train_freq: int
-    state_attributes = ("client_steps",)
+    state_attributes: ClassVar[tuple[str, ...]] = ("client_steps",)
 
     def __init__(
         self,

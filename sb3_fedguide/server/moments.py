@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from sb3_fedguide.server.strategy import Strategy
 START_COUNT = 1e-4
 
 
-class Moments(NamedTuple):
+@dataclass(frozen=True)
+class Moments:
     """Of ``count`` samples; mean and (population) variance by coordinate, float64."""
 
     count: float
@@ -92,7 +93,8 @@ class ObservationMoments(Strategy):
         else:
             start = Moments(self.count, self.mean, self.var)
         pooled = [start, *pooled]
-        self.count, self.mean, self.var = merge(pooled)
+        merged = merge(pooled)
+        self.count, self.mean, self.var = merged.count, merged.mean, merged.var
 
     def latest(self, client: int) -> Payload:
         if self.mean is None or self.var is None:

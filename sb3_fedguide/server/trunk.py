@@ -28,8 +28,8 @@ _MOST_UPDATES = 100
 def merge_moments(uploads: Sequence[Mapping[str, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of the union of the clients' data, see :func:`~sb3_fedguide.server.moments.merge`."""
     parts = [Moments(float(upload[N_SAMPLES]), upload["mean"], upload["var"]) for upload in uploads]
-    _, mean, var = merge(parts)
-    return mean, np.sqrt(var)
+    merged = merge(parts)
+    return merged.mean, np.sqrt(merged.var)
 
 
 def average_uploads(uploads: Sequence[Mapping[str, np.ndarray]], n_samples: Sequence[int]) -> Payload:
