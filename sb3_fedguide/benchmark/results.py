@@ -26,11 +26,13 @@ class Result:
     """One finished run.
 
     :param n_episodes: episodes per client in an evaluation
-    :param final: client-average return of the deployed policies after the last round
+    :param final: client-average return of the deployed policies after the last round; where clients tested what they were
+        sent, in the last evaluation within as many environment steps as the rounds have without tests
     :param worst_client: the lowest client's return there
     :param success: share of the episodes there that succeeded; ``None`` where the environments do not say
     :param broadcast: client-average return of the policy that the server sent last; ``None`` where it sends none
     :param curve: evaluated round to client-average return of the deployed policies
+    :param spent: evaluated round to the environment steps until then, in rounds without tests
     :param bytes_up: uploaded per round by all clients together
     :param bytes_down: sent per round to all clients together
     :param median_seconds: of the median round
@@ -50,6 +52,7 @@ class Result:
     success: float | None
     broadcast: float | None
     curve: Mapping[int, float]
+    spent: Mapping[int, float]
     bytes_up: float
     bytes_down: float
     median_seconds: float
@@ -64,6 +67,8 @@ class Measures:
     :param W: its worst seed
     :param CV: deviation over absolute mean of the last twenty rounds, averaged over seeds; ``None`` where it is not defined
     :param worst_client: the lowest client's return, averaged over seeds
+    :param speed_up: rounds of a run over the first evaluated round in which the curve is at the target; ``None`` without a
+        target, or where it is never reached
     :param curve: asked-for round to client-average return, averaged over seeds; without those that were not evaluated
     :param seconds_per_round: the fastest seed's median: other work on the machine only adds
     :param paper_F: of the paper
@@ -83,6 +88,7 @@ class Measures:
     bytes_down_per_round: float
     seconds_per_round: float
     paper_F: float | None
+    speed_up: float | None = None
 
 
 def result_folder(folder: Path, family: str, label: str) -> Path:
@@ -116,6 +122,7 @@ def _result(path: Path, content: dict[str, Any]) -> Result:
     deployed, rates = content["deployed"], content["deployed"].get("success_rates")
     broadcast, rounds = content.get("broadcast"), int(content["rounds_done"])
     config = content.get("config")
+    final = _final_returns(content)
     return Result(
         path=path,
         method=str(content["algo"]),
@@ -125,16 +132,34 @@ def _result(path: Path, content: dict[str, Any]) -> Result:
         conf_file=str(content["conf_file"]),
         metadata_hash=str(content["metadata_hash"]),
         n_episodes=int(deployed["n_episodes"]),
-        final=float(deployed["average"]),
-        worst_client=float(deployed["worst_client"]),
+        final=float(np.mean(final) if final else deployed["average"]),
+        worst_client=float(np.min(final) if final else deployed["worst_client"]),
         success=None if rates is None else float(np.mean([rate for rate in rates if rate is not None])),
         broadcast=None if broadcast is None else float(broadcast["average"]),
         curve={int(round): float(value) for round, value in deployed["curve"]},
+        spent=_spent(content),
         bytes_up=float(content["bytes_up"]) / rounds,
         bytes_down=float(content["bytes_down"]) / rounds,
         median_seconds=float(content["seconds"]["median_round"]),
         config=None if config is None else dict(config),
     )
+
+
+def _final_returns(content: Mapping[str, Any]) -> list[float]:
+    """Where clients tested: each one's return in the last evaluation within the steps that the rounds have without tests."""
+    if not (tests := content.get("test_timesteps", 0)):
+        return []
+    budget = content["timesteps"] - tests
+    within = [returns for _, steps, returns in content["deployed"]["client_curve"] if steps <= budget]
+    return [float(value) for value in within[-1]] if within else []
+
+
+def _spent(content: Mapping[str, Any]) -> dict[int, float]:
+    deployed, tests = content["deployed"], content.get("test_timesteps", 0)
+    if not tests:
+        return {int(round): float(round) for round, _ in deployed["curve"]}
+    per_round = (content["timesteps"] - tests) / content["rounds_done"]
+    return {int(round): steps / per_round for round, steps, _ in deployed["client_curve"]}
 
 
 def read_results(
@@ -166,11 +191,12 @@ def read_results(
     return found
 
 
-def measure(results: Sequence[Result], at_rounds: Sequence[int] = ()) -> Measures:
+def measure(results: Sequence[Result], at_rounds: Sequence[int] = (), target: float | None = None) -> Measures:
     """The measures of one method on one family.
 
     :param results: one per seed
     :param at_rounds: rounds of the curve to report as well
+    :param target: return that counts for the speed-up, such as F of another method
     """
     final = np.array([result.final for result in results])
     success = [result.success for result in results if result.success is not None]
@@ -197,7 +223,20 @@ def measure(results: Sequence[Result], at_rounds: Sequence[int] = ()) -> Measure
         bytes_down_per_round=float(np.mean([result.bytes_down for result in results])),
         seconds_per_round=min(result.median_seconds for result in results),
         paper_F=PAPER_F.get(results[0].family, {}).get(results[0].method),
+        speed_up=None if target is None else speed_up(results, target),
     )
+
+
+def speed_up(results: Sequence[Result], target: float) -> float | None:
+    """With how many times fewer environment steps than a run has the seeds' mean curve reaches ``target``; ``None`` if never.
+
+    :param results: one per seed; rounds that not all of them evaluated do not count
+    """
+    everywhere = set.intersection(*(set(result.curve) for result in results))
+    for round in sorted(everywhere):
+        if np.mean([result.curve[round] for result in results]) >= target:
+            return results[0].n_rounds / float(np.mean([result.spent[round] for result in results]))
+    return None
 
 
 def volatility(result: Result) -> float | None:

@@ -42,6 +42,7 @@ def rows_of(measures: Sequence[Measures]) -> list[Row]:
         "method": lambda row: row.method,
         "seeds": lambda row: str(len(row.seeds)),
         "F": lambda row: f"{row.F:.4g} ± {row.F_std:.3g}" if len(row.seeds) > 1 else f"{row.F:.4g}",
+        "speed-up": lambda row: _number(row.speed_up, ".2f"),
         "worst client": lambda row: f"{row.worst_client:.4g}",
         "W": lambda row: f"{row.W:.4g}",
         "CV of the last 20 rounds": lambda row: _number(row.CV, ".3f"),

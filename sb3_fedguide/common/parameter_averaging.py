@@ -84,7 +84,8 @@ class ParameterAveraging(Federation):
         return averaged_prefixes(self.average, self.policy.actor_prefixes, self.policy.critic_prefixes)
 
     def sends_policy(self, round: int) -> bool:
-        return self.average != "critic" and averaging_is_due(round, self.average_every, self.average_until)
+        due = averaging_is_due(round, self.average_every, self.average_until)
+        return self.average != "critic" and due and self._mix() > 0
 
     def upload(self, index: int) -> Payload:
         payload = super().upload(index)
