@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from sb3_fedguide import FedAvg, FederatedEvalCallback, FedRL
+from sb3_fedguide.common.participation import simulate_delays
 from sb3_fedguide.common.screening import LONGEST_WAIT, clearly_better
+from sb3_fedguide.server.delays import parse_delays
 from sb3_fedguide.server.payload import N_SAMPLES
 from tests.conftest import assert_same_parameters, parameters_of
 
@@ -99,6 +101,17 @@ def test_tests_cost_no_more_than_their_share_and_are_counted(point_envs, tmp_pat
     with (tmp_path / "evaluations.csv").open() as file:
         last = list(csv.DictReader(file))[-1]
     assert int(last["timesteps"]) == model.environment_steps
+
+
+def test_tests_take_simulated_time(point_envs):
+    def seconds(screening: float) -> float:
+        model = FedAvg("MlpPolicy", point_envs(3), **{**SCREENED, "screening": screening})
+        simulate_delays(model, parse_delays("sync:median=60,spread=0,jitter=0"))
+        model.learn(3 * 3 * 128)
+        assert (model.test_steps > 0) == (screening > 0)
+        return model.delays.seconds
+
+    assert seconds(0.0) == pytest.approx(180.0) and seconds(0.5) > 185
 
 
 def test_tests_disturb_nothing(point_envs):

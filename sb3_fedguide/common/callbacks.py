@@ -134,7 +134,7 @@ class ExchangeCallback(RoundCallback):
     def _on_round_start(self) -> None:
         model = self.model
         if model.delays is not None:
-            model.take_part(model.delays.begin(model.round, model.client_fraction))
+            model.take_part(model.delays.begin(model.round, model.client_fraction, model.test_work()))
         missing = np.flatnonzero(model.present & model.outdated).tolist()
         model.take_broadcasts({index: self.server.catch_up(model.client_ids[index]) for index in missing})
         self._remember_outdated()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_fedguide.common.normalization import FederatedNormalizer
@@ -62,6 +63,10 @@ class Exchange(BaseAlgorithm):
     def outgoing(self, index: int) -> Payload:
         """All that the client at position ``index`` sends: :meth:`upload`, and its round's moments where they are shared."""
         return {**self.upload(index), **self.normalizer.round_moments(index)}
+
+    def test_work(self) -> np.ndarray | None:
+        """Environment steps of each client's tests since it was last asked, in rounds, ``(n_clients,)``; ``None`` for none."""
+        return None
 
     def take_broadcasts(self, broadcasts: Mapping[int, Payload]) -> None:
         """Take all that the server sent.

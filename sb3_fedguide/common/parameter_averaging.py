@@ -122,6 +122,14 @@ class ParameterAveraging(Federation):
         if self.screening:
             self._tests.begin()
 
+    def test_work(self) -> np.ndarray | None:
+        if not self.screening:
+            return None
+        untimed = self._tests.begin()["untimed"]
+        work = untimed / self.rollout_size
+        untimed[:] = 0
+        return work
+
     def take_broadcasts(self, broadcasts: Mapping[int, Payload]) -> None:
         mix = self._mix()
         # who has nothing of its own, or nothing to do with what the others have, takes all or nothing

@@ -44,12 +44,13 @@ class Screening:
         self._env: FederatedVecEnv | None = None
 
     def begin(self) -> dict[str, np.ndarray]:
-        """Per client, ``(n_clients,)``: whether it is alone, the steps of its tests, the round of its next one, and the
-        rounds that it then waits."""
+        """Per client, ``(n_clients,)``: whether it is alone, the steps of its tests (and of those without simulated time yet),
+        the round of its next one, and the rounds that it then waits."""
         state, n_clients = self.model.screening_state, self.model.n_clients
         if not state:
             state["alone"] = np.zeros(n_clients, dtype=bool)
             state["steps"] = np.zeros(n_clients, dtype=int)
+            state["untimed"] = np.zeros(n_clients, dtype=int)
             state["next_round"] = np.full(n_clients, FIRST_ROUND)
             state["wait"] = np.ones(n_clients, dtype=int)
         return state
@@ -119,7 +120,8 @@ class Screening:
             for index, parameters in own.items():
                 model.policy.load_client(index, parameters)
             steps = np.where(active, tested.lengths, 0).sum(axis=1)
-            self.begin()["steps"][:] += steps
+            for name in ("steps", "untimed"):
+                self.begin()[name][:] += steps
             model.test_steps += int(steps.sum())
             results.append(tested.returns)
         return {index: (results[0][index, :n], results[1][index, :n]) for index, n in episodes.items()}

@@ -55,7 +55,7 @@ def robust_mean(values: np.ndarray, aggregator: Aggregator, trim_fraction: float
 
 
 def fedexp_step(latest: Payload, uploads: Mapping[int, Payload], change: Payload, epsilon: float = 1e-12) -> float:
-    """FedExP's step: ``max(1, sum_i w_i |Delta_i|^2 / (2 (|Delta|^2 + epsilon)))`` (Jhunjhunwala et al. 2023, Eq. 9).
+    """FedExP's step: ``max(1, sum_i w_i |Delta_i|^2 / (2 (|Delta|^2 + epsilon)))`` (Jhunjhunwala et al. 2023).
 
     Clients whose updates are orthogonal get a long step, those that agree a step of one.
 

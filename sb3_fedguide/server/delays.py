@@ -177,16 +177,18 @@ class Delays:
         deviation = settings.spread * speed + settings.jitter * rng.standard_normal()
         return settings.median * math.exp(deviation), bool(rng.random() < settings.dropout)
 
-    def begin(self, round: int, client_fraction: float = 1.0) -> np.ndarray:
+    def begin(self, round: int, client_fraction: float = 1.0, extra: np.ndarray | None = None) -> np.ndarray:
         """Let a share of those begin that are idle.
 
         :param round: complete rounds, for the draw of who takes part
+        :param extra: work of each client beside its round's, as a share of it, ``(n_clients,)``; none by default
         :return: who begins, ``(n_clients,)`` bool
         """
         present = np.zeros(len(self.clients), dtype=bool)
         present[participants(np.flatnonzero(self.idle).tolist(), self.seed, round, client_fraction)] = True
         for index in np.flatnonzero(present).tolist():
             seconds, self.lost[index] = self.draw(index)
+            seconds *= 1.0 if extra is None else 1.0 + float(extra[index])
             assert self.settings.timeout is not None
             self.idle_at[index] = self.seconds + (self.settings.timeout if self.lost[index] else seconds)
         self.begun[present] += 1
