@@ -8,6 +8,7 @@ import torch as th
 
 from sb3_fedguide import FedAvg, FedGuide, FedGuideA, FedGuideR, FedRL, Local, Pooled
 from sb3_fedguide.common.callbacks import RoundCallback
+from sb3_fedguide.common.newcomers import start_from
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.server.averaging import Averaging, fedexp_step, weighted_average
 from sb3_fedguide.server.moments import Moments, ObservationMoments, merge
@@ -312,3 +313,27 @@ def test_pooled_stays_in_one_process(point_envs, small):
         Processes(2).attach(Pooled("MlpPolicy", point_envs(2), **small))
     with pytest.raises(ValueError, match="one place"):
         Site(Pooled("MlpPolicy", point_envs(1), **small), 2, "nowhere")
+
+
+# Who comes late
+
+
+def test_newcomers_start_from_the_mean_policy_and_what_all_have_seen(point_envs, small, tmp_path):
+    known = FedAvg("MlpPolicy", point_envs(3), normalize="shared", **small).learn(2 * 3 * 64)
+    known.export_parameters(tmp_path / "known.npz")
+    late = FedAvg("MlpPolicy", point_envs(2), normalize="shared", **small)
+    start_from(late, tmp_path / "known.npz")
+    for client in range(2):
+        for name, tensor in parameters_of(late, client).items():
+            np.testing.assert_allclose(
+                tensor, th.stack([parameters_of(known, k)[name] for k in range(3)]).mean(dim=0), atol=1e-6
+            )
+    np.testing.assert_allclose(late.normalizer.obs.mean[1], known.normalizer.obs.mean[0], rtol=1e-12)
+    late.learn(2 * 64)  # the first exchange pools what both begin with, and leaves it as it is
+    assert np.abs(late.normalizer.obs.mean[0] - known.normalizer.obs.mean[0]).max() < 0.2
+    with pytest.raises(ValueError, match="before they train"):
+        start_from(late, tmp_path / "known.npz")
+    with pytest.raises(ValueError, match="normalize is True"):
+        start_from(FedAvg("MlpPolicy", point_envs(2), **small), tmp_path / "known.npz")
+    with pytest.raises(ValueError, match="no parameter file"):
+        start_from(FedAvg("MlpPolicy", point_envs(2), **small), tmp_path / "nothing.npz")
