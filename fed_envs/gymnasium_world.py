@@ -36,7 +36,7 @@ def gymnasium_family(
         {"client": client, "id": id, **({"kwargs": dict(own)} if own else {})}
         for client, (id, own) in enumerate(zip(ids, kwargs, strict=True))
     ]
-    name = name or re.sub(r"\W", "_", "_".join(dict.fromkeys(ids)))[:60]
+    name = name or re.sub(r"\W", "_", "_".join(dict.fromkeys(ids)), flags=re.ASCII)[:60]
     content = {
         "schema_version": 1, "family": name if name[0].isalpha() else f"Env_{name}", "world": "gymnasium",
         "backbone": BACKBONE, "max_episode_steps": 1, "clients": clients,

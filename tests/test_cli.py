@@ -40,7 +40,7 @@ WRONG = {
     "--algo FedGuide --env Bandit2D": "Did you mean 'fedguide'",
     "--env HoperHard": "Did you mean 'HopperHard'",
     "--env fed_envs/HoperHard-v0": "Did you mean 'HopperHard'",
-    "--env CartPole-v1": "unknown environment 'CartPole-v1'",
+    "--env CartPole-v1": "CartPole-v1 is one environment, and a federation has several clients",
     "": "--env FAMILY",
     "--env Bandit2D --rouns 3": "Did you mean '--rounds'",
     "--env Bandit2D extra": "unknown argument 'extra'",
@@ -151,8 +151,8 @@ def local_run(tmp_path_factory):
 def test_a_run_folder_says_what_was_run(local_run):
     names = {path.name for path in local_run.iterdir()}
     assert names == {
-        "args.yml", "command.txt", "config.yml", "evaluations.csv", "metadata.json", "metadata.sha256", "model.zip",
-        "parameters.npz", "summary.json", "tb", "versions.json",
+        "args.yml", "checkpoints", "command.txt", "config.yml", "evaluations.csv", "metadata.json", "metadata.sha256",
+        "model.zip", "parameters.npz", "summary.json", "tb", "versions.json",
     }  # fmt: skip
     config = yaml.safe_load((local_run / "config.yml").read_text())
     assert (config["n_epochs"], config["bc_weight"], config["n_rounds"], config["rollout_size"]) == (2, 0, 2, 200)

@@ -125,8 +125,12 @@ def _successes(successes: np.ndarray, say: np.ndarray) -> np.ndarray | None:
     """As :class:`Evaluation` has them. A client that says so of some episodes had no success in the others."""
     if not say.any():
         return None
-    silent = np.logical_not(say.any(axis=1))
-    return np.where(silent[:, None], np.nan, successes) if silent.any() else successes
+    silent = np.flatnonzero(say.sum(axis=1) == 0)
+    if not len(silent):
+        return successes
+    successes = successes.astype(float)
+    successes[silent] = np.nan
+    return successes
 
 
 class FederatedEvalCallback(RoundCallback):

@@ -119,8 +119,8 @@ class Resumable(BaseAlgorithm):
         """
         rows, observations, clients = self._federated_env().begin_lost_episodes()
         if len(rows):
-            assert self._last_obs is not None and self._last_episode_starts is not None
-            self._last_obs[rows], self._last_episode_starts[rows] = observations, True  # type: ignore[call-overload,index]
+            assert isinstance(self._last_obs, np.ndarray) and self._last_episode_starts is not None
+            self._last_obs[rows], self._last_episode_starts[rows] = observations, True
             self.normalizer.returns.reshape(-1)[rows] = 0.0
         return clients
 
