@@ -115,6 +115,7 @@ class FederatedVecEnv(VecEnv):
             raise ValueError("each function must return a new environment at every call, not the same one again")
         _check_spaces(self.envs)
         super().__init__(len(self.envs), self.envs[0].observation_space, self.envs[0].action_space)
+        self.raw_observation_space = self.observation_space
         self._active = np.ones(self.num_envs, dtype=bool)
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
         self._returns = np.zeros(self.num_envs)

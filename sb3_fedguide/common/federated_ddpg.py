@@ -18,8 +18,7 @@ from torch import nn
 
 from fed_envs import FederatedVecEnv
 from fed_envs.state import State
-from sb3_fedguide.common.ddpg_policy import BoundedActor, StackedDDPGPolicy
-from sb3_fedguide.common.export import client_ddpg, export_program
+from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation, FederationLike, as_federated_env
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
@@ -324,20 +323,6 @@ class FederatedDDPG(Federation, DDPG):
             for index, value in zip(learned, per_client, strict=True):
                 self.record_client(self.client_ids[index], name, float(value))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    def client(self, client_id: int) -> DDPG:
-        """Client ``client_id``'s policy as an ordinary ``stable_baselines3.DDPG`` that takes raw observations.
-
-        Networks, targets and normalisation are copied; Adam's moments and the replay buffer are not.
-
-        :raises ValueError: for a client that does not live here
-        """
-        return client_ddpg(self, self._position(client_id))
-
-    def export(self, client_id: int, path: str | Path) -> None:
-        actor: Any = self.client(client_id).policy.actor
-        policy = nn.Sequential(actor.features_extractor, BoundedActor(actor.mu, self.action_space))  # type: ignore[arg-type]
-        export_program(policy, self.observation_space.shape[0], path)  # type: ignore[index]
 
     def save_state(self) -> State:
         assert self.replay_buffer is not None

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3 import DDPG, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -23,7 +22,6 @@ from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback, RoundProgressCallback, round_callbacks
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
-from sb3_fedguide.common.export import client_model, export_client
 from sb3_fedguide.common.faults import check_policies, in_round
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.parameters import ParameterFiles
@@ -77,6 +75,7 @@ class Federation(WarmStart, ParameterFiles, Resumable):
         self.client_ids: list[int] = [] if env is None else list(env.client_ids)
         self.n_envs_per_client = 1 if env is None else env.n_envs_per_client
         self.family = None if env is None else env.family
+        self.raw_observation_space = None if env is None else env.raw_observation_space
         self.normalize = normalize
         self.bc_weight = bc_weight
         self.pretraining_config = PretrainingConfig.model_validate(pretraining or {})
@@ -350,27 +349,6 @@ class Federation(WarmStart, ParameterFiles, Resumable):
         split = observation.reshape(self.n_clients, -1, observation.shape[-1])
         normalized = self.normalizer.normalize_obs(split).reshape(observation.shape)
         return self.policy.predict(normalized, state, episode_start, deterministic)
-
-    def client(self, client_id: int) -> PPO | DDPG:
-        """Client ``client_id``'s policy as an ordinary ``stable_baselines3`` model that takes raw observations.
-
-        :raises ValueError: for a client that does not live here
-        """
-        return client_model(self, self._position(client_id))
-
-    def export(self, client_id: int, path: str | Path) -> None:
-        """Write client ``client_id``'s deterministic policy as a ``.pt2`` file: raw observations to executed actions.
-
-        ``torch.export.load(path).module()`` runs it where neither this package nor Stable-Baselines3 is installed.
-
-        :raises ValueError: for a client that does not live here
-        """
-        export_client(self, self._position(client_id), path)
-
-    def _position(self, client_id: int) -> int:
-        if client_id not in self.client_ids:
-            raise ValueError(f"no client {client_id} here; this federation holds the clients {self.client_ids}")
-        return self.client_ids.index(client_id)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "normalizer", "episode_infos", "engine"]
