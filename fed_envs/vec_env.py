@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 import os
 import sys
 import time
@@ -12,6 +14,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import FlattenObservation
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
@@ -22,7 +25,9 @@ from fed_envs.metadata import Family, load_family
 from fed_envs.registration import environment_class
 from fed_envs.seeding import integer_seed
 from fed_envs.state import State, load_state, save_state
-from fed_envs.world import Batch, Runner, run_here
+from fed_envs.world import Batch, Runner, action_dtype, run_here
+
+logger = logging.getLogger(__name__)
 
 EnvFactory = Callable[[], gymnasium.Env]
 
@@ -67,7 +72,8 @@ class FederatedVecEnv(VecEnv):
     It pickles and copies with the state of simulators and random streams, so that a copy goes on exactly like the original.
 
     :param family: a family's name, the path of a metadata file, a :class:`fed_envs.Family`, or a list of functions that make
-        an environment, one per client (those are stepped one by one, and their infos are passed on)
+        an environment, one per client (those are stepped one by one, and their infos are passed on; observations that are
+        not flat arrays are flattened)
     :param n_envs_per_client: copies of each client's environment
     :param clients: ids of the clients that live here; all by default
     :param num_threads: at most so many threads step the simulators, each at least eight of them; the result does not depend
@@ -114,8 +120,10 @@ class FederatedVecEnv(VecEnv):
         if len({id(env.unwrapped) for env in self.envs}) != len(self.envs):
             raise ValueError("each function must return a new environment at every call, not the same one again")
         _check_spaces(self.envs)
+        #: of the environments themselves
+        self.raw_observation_space: spaces.Space = self.envs[0].observation_space
+        self.envs = [flattened(env) for env in self.envs]
         super().__init__(len(self.envs), self.envs[0].observation_space, self.envs[0].action_space)
-        self.raw_observation_space = self.observation_space
         self._active = np.ones(self.num_envs, dtype=bool)
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
         self._returns = np.zeros(self.num_envs)
@@ -195,7 +203,7 @@ class FederatedVecEnv(VecEnv):
         batch, actions, active = self._batch, self._actions, self._active
         self._actions = None
         if self.family is not None:
-            actions = np.asarray(actions, dtype=np.float32)
+            actions = np.asarray(actions, dtype=action_dtype(self.action_space))
             if actions.shape != (self.num_envs, *self.action_space.shape):  # type: ignore[misc]
                 raise ValueError(f"expected actions of shape {(self.num_envs, *self.action_space.shape)}, got {actions.shape}")  # type: ignore[misc]
         all_active = bool(active.all())
@@ -327,6 +335,29 @@ class FederatedVecEnv(VecEnv):
         return [self.envs[index] for index in self._get_indices(indices)]
 
 
+def flattened(env: gymnasium.Env) -> gymnasium.Env:
+    """The environment itself where its observations are flat arrays, and Gymnasium's wrapper around it otherwise.
+
+    :raises ValueError: where there is no flat array of them
+    """
+    space = env.observation_space
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        return env
+    if not space.is_np_flattenable:
+        raise ValueError(
+            f"observations must have one size, so that they are flat arrays of numbers, but their space is {space}"
+        )
+    wrapped = FlattenObservation(env)
+    _say_flattened(str(space), str(wrapped.observation_space.shape))
+    return wrapped
+
+
+@functools.cache  # once for all copies of all clients
+def _say_flattened(space: str, shape: str) -> None:
+    logger.warning("observations of the space %s are flattened (gymnasium.wrappers.FlattenObservation) to the shape %s", space,
+                   shape)  # fmt: skip
+
+
 def check_shape(observation: Any, shape: tuple[int, ...]) -> None:
     """:raises ValueError: for an observation of another shape, which NumPy may stretch without a word"""
     if np.shape(observation) != shape:
@@ -345,11 +376,6 @@ def _checked_clients(clients: Sequence[int] | None, n_clients: int, name: str) -
 
 def _check_spaces(envs: Sequence[gymnasium.Env]) -> None:
     first = envs[0]
-    if not isinstance(first.observation_space, spaces.Box):
-        raise ValueError(
-            f"observations must be a Box, got {first.observation_space}; "
-            "flatten others with gymnasium.wrappers.FlattenObservation"
-        )
     for number, env in enumerate(envs):
         for kind in ("observation_space", "action_space"):
             if getattr(env, kind) != getattr(first, kind):

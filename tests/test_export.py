@@ -22,6 +22,7 @@ from sb3_fedguide.common.site import PARAMETERS, SITE, Site
 from sb3_fedguide.common.spaces import describe_space, space_from
 from sb3_fedguide.server.serve import ServerConfig, serve
 from tests.loop_transport import LoopTransport
+from tests.test_discrete_actions import SPACES, choices
 
 DDPG_SETTINGS = {"rollout_size": 40, "learning_starts": 20, "batch_size": 8, "seed": 3}
 
@@ -91,7 +92,8 @@ def test_policies_act_the_same_where_this_package_is_not(point_envs, small, tmp_
     local = Local("MlpPolicy", point_envs(2), normalize=True, **small).learn(2 * 2 * 64)
     plain = FedAvg("MlpPolicy", point_envs(2), **{**small, "policy_kwargs": relu}).learn(2 * 64)
     fedrl = FedRL("MlpPolicy", point_envs(2), normalize=True, **DDPG_SETTINGS).learn(2 * 2 * 40)
-    for name, model in (("local", local), ("plain", plain), ("fedrl", fedrl)):
+    discrete = {kind: Local("MlpPolicy", choices(kind), normalize=True, **small).learn(2 * 64) for kind in SPACES}
+    for name, model in {"local": local, "plain": plain, "fedrl": fedrl, **discrete}.items():
         give_away(model, tmp_path, name, forms)
     elsewhere(tmp_path)
 

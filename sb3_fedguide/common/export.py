@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ from sb3_fedguide.common.ddpg_policy import BoundedActor
 from sb3_fedguide.common.distributions import Gaussian, action_distribution
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.spaces import is_plain
+
+logger = logging.getLogger(__name__)
 
 #: what further training takes over from the federation, by SB3's names
 SETTINGS: dict[str, tuple[str, ...]] = {
@@ -122,7 +125,7 @@ class ClientPolicy:
 
     def module(self) -> DeployedPolicy:
         """Its deterministic policy as a plain module."""
-        return DeployedPolicy(self)
+        return DeployedPolicy(self).eval().requires_grad_(False)
 
     @property
     def obs_dim(self) -> int:
@@ -249,7 +252,7 @@ def _write_onnx(policy: ClientPolicy, file: Any) -> None:
 
 
 def _traceable(policy: ClientPolicy) -> tuple[DeployedPolicy, th.Tensor]:
-    return policy.module().eval().requires_grad_(False), th.zeros(2, policy.obs_dim)
+    return policy.module(), th.zeros(2, policy.obs_dim)
 
 
 #: How a policy is written, by the suffix of the file: SB3's archive, a ``torch.export`` program, TorchScript, ONNX.
@@ -296,6 +299,11 @@ class ClientPolicies(BaseAlgorithm):
         """
         if client_id not in self.client_ids:
             raise ValueError(f"no client {client_id} here; this federation holds the clients {self.client_ids}")
+        if self.raw_observation_space not in (None, self.client_observation_space):
+            logger.warning(
+                "client %d's policy takes gymnasium.spaces.flatten(space, observation), since Stable-Baselines3 has no policy "
+                "for the space %s", client_id, self.raw_observation_space,
+            )  # fmt: skip
         index, moments = self.client_ids.index(client_id), self.normalizer.obs
         return ClientPolicy(
             self.learner,

@@ -18,7 +18,7 @@ from torch import nn
 
 from fed_envs import FederatedVecEnv
 from fed_envs.state import State
-from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
+from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy, check_ddpg_actions
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation, FederationLike, as_federated_env
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
@@ -113,6 +113,8 @@ class FederatedDDPG(Federation, DDPG):
     ) -> None:
         env = as_federated_env(env, n_envs_per_client, clients, num_threads)
         self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
+        if env is not None:
+            check_ddpg_actions(env.action_space)
         self.rollout_size = rollout_size
         self.noise_theta, self.noise_sigma, self.noise_dt = noise_theta, noise_sigma, noise_dt
         #: steps that each client has taken in its life, ``(n_clients,)``

@@ -14,7 +14,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -199,6 +199,16 @@ class Federation(WarmStart, ParameterFiles, Resumable):
         """Shapes of what a client uploads by name, known before the offline stage; what only comes later is left out."""
         return {name: list(array.shape) for name, array in self.upload(0).items()}
 
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        """:raises ValueError: for a policy of which there is no stacked one, with what to do"""
+        if policy_name in self.policy_aliases:
+            return self.policy_aliases[policy_name]
+        reason = {
+            "MultiInputPolicy": "observations that are a Dict are flattened for it",
+            "CnnPolicy": "images are flattened for it, and there are no convolutions",
+        }.get(policy_name, "there is no other")
+        raise ValueError(f"policy={policy_name!r}: a federation's policy is 'MlpPolicy'; {reason}")
+
     def learn(
         self: SelfFederation,
         total_timesteps: int,
@@ -343,7 +353,7 @@ class Federation(WarmStart, ParameterFiles, Resumable):
         observation = np.asarray(observation)
         if observation.ndim != 2 or len(observation) % self.n_clients:
             raise ValueError(
-                f"predict() takes observations of all {self.n_clients} clients, client by client, but got shape "
+                f"predict() takes flat observations of all {self.n_clients} clients, client by client, but got shape "
                 f"{observation.shape}; take one client's own model with client(k)"
             )
         split = observation.reshape(self.n_clients, -1, observation.shape[-1])
