@@ -344,9 +344,7 @@ def flattened(env: gymnasium.Env) -> gymnasium.Env:
     if isinstance(space, spaces.Box) and len(space.shape) == 1:
         return env
     if not space.is_np_flattenable:
-        raise ValueError(
-            f"observations must have one size, so that they are flat arrays of numbers, but their space is {space}"
-        )
+        raise ValueError(f"observations must have one size, to be flat arrays of numbers, but their space is {space}")
     wrapped = FlattenObservation(env)
     _say_flattened(str(space), str(wrapped.observation_space.shape))
     return wrapped

@@ -170,6 +170,8 @@ class DeployedPolicy(nn.Module):
 
     mean: th.Tensor
     deviation: th.Tensor
+    low: th.Tensor
+    high: th.Tensor
 
     def __init__(self, policy: ClientPolicy) -> None:
         super().__init__()

@@ -22,7 +22,7 @@ ACTOR_PREFIXES, CRITIC_PREFIXES = PPO_ACTOR, PPO_CRITIC
 
 
 class StackedActor(nn.Module):
-    """The clients' actors alone: ``(n_clients, batch, obs_dim)`` to mean actions or logits, ``(n_clients, batch, n_outputs)``."""
+    """The clients' actors alone: ``(n_clients, batch, obs_dim)`` to means or logits, ``(n_clients, batch, n_outputs)``."""
 
     def __init__(self, policy_net: nn.Module, action_net: nn.Module) -> None:
         super().__init__()
@@ -140,7 +140,7 @@ class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
         return actions.flatten(0, 1), self.values(obs).reshape(-1, 1), log_prob.flatten()
 
     def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        """Values, log-probabilities and entropy of stored actions, client-major and flat as SB3 returns them."""
+        """Values and log-probabilities of stored actions, and each client's mean entropy, client-major and flat as in SB3."""
         assert isinstance(obs, th.Tensor)
         obs = self.split_clients(obs)
         mean = self.actor_mean(obs)
