@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,12 +12,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import FlattenObservation
 from stable_baselines3.common import monitor
 from stable_baselines3.common.monitor import Monitor
 
 from fed_envs.faults import ClientError, ContractError, RowError
 from fed_envs.state import State, gives_state
 from fed_envs.world import Batch, Runner, run_here
+
+logger = logging.getLogger(__name__)
 
 EnvFactory = Callable[[], gymnasium.Env]
 
@@ -107,11 +112,6 @@ def check_spaces(envs: Sequence[gymnasium.Env], client_ids: Sequence[int]) -> No
         for kind in ("observation_space", "action_space"):
             if not isinstance(getattr(env, kind, None), spaces.Space):
                 raise ClientError([client_ids[row // n_copies]], f"its environment has no {kind}; set it in the constructor")
-    if not isinstance(first.observation_space, spaces.Box) or len(first.observation_space.shape) != 1:
-        raise ValueError(
-            f"observations must be a Box of one dimension, got {first.observation_space}; "
-            "flatten others with gymnasium.wrappers.FlattenObservation"
-        )
     for row, env in enumerate(envs):
         for kind in ("observation_space", "action_space"):
             if getattr(env, kind) != getattr(first, kind):
@@ -119,6 +119,27 @@ def check_spaces(envs: Sequence[gymnasium.Env], client_ids: Sequence[int]) -> No
                     f"all clients must share their spaces: client {client_ids[row // n_copies]} has {kind} "
                     f"{getattr(env, kind)}, client {client_ids[0]} has {getattr(first, kind)}"
                 )
+
+
+def flattened(env: gymnasium.Env) -> gymnasium.Env:
+    """The environment itself where its observations are flat arrays, and Gymnasium's wrapper around it otherwise.
+
+    :raises ValueError: where there is no flat array of them
+    """
+    space = env.observation_space
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        return env
+    if not space.is_np_flattenable:
+        raise ValueError(f"observations must have one size, to be flat arrays of numbers, but their space is {space}")
+    wrapped = FlattenObservation(env)
+    _say_flattened(str(space), str(wrapped.observation_space.shape))
+    return wrapped
+
+
+@functools.cache  # once for all copies of all clients
+def _say_flattened(space: str, shape: str) -> None:
+    logger.warning("observations of the space %s are flattened (gymnasium.wrappers.FlattenObservation) to the shape %s", space,
+                   shape)  # fmt: skip
 
 
 def check_monitor_files(envs: Sequence[gymnasium.Env], client_ids: Sequence[int]) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
@@ -22,6 +23,7 @@ from fed_envs.factories import (
     Positions,
     check_monitor_files,
     check_spaces,
+    flattened,
     make_envs,
     monitors_without_files,
     own_record,
@@ -32,7 +34,7 @@ from fed_envs.metadata import Family, load_family
 from fed_envs.registration import environment_class
 from fed_envs.seeding import integer_seed
 from fed_envs.state import State, load_state, save_state
-from fed_envs.world import Batch
+from fed_envs.world import Batch, action_dtype
 
 #: To wake a thread costs as much as some five steps of a simulator, so each is given at least this many.
 MIN_ROWS_PER_THREAD = 8
@@ -51,7 +53,8 @@ class FederatedVecEnv(VecEnv):
     It pickles and copies with the state of simulators and random streams, so that a copy goes on exactly like the original.
 
     :param family: a family's name, the path of a metadata file, a :class:`fed_envs.Family`, or a list of functions that make
-        an environment, one per client (those are stepped one by one, and their infos are passed on)
+        an environment, one per client (those are stepped one by one, and their infos are passed on; observations that are
+        not flat arrays are flattened)
     :param n_envs_per_client: copies of each client's environment
     :param clients: ids of the clients that live here; all by default
     :param num_threads: at most so many threads step the simulators, each at least eight of them; the result does not depend
@@ -100,6 +103,9 @@ class FederatedVecEnv(VecEnv):
         self.envs = make_envs(factories, self.client_ids, n_envs_per_client)
         check_spaces(self.envs, self.client_ids)
         check_monitor_files(self.envs, self.client_ids)
+        #: of the environments themselves
+        self.raw_observation_space: spaces.Space = self.envs[0].observation_space
+        self.envs = [flattened(env) for env in self.envs]
         super().__init__(len(self.envs), self.envs[0].observation_space, self.envs[0].action_space)
         self._active = np.ones(self.num_envs, dtype=bool)
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
@@ -183,7 +189,7 @@ class FederatedVecEnv(VecEnv):
         batch, actions, active = self._batch, self._actions, self._active
         self._actions = None
         if self.family is not None:
-            actions = np.asarray(actions, dtype=np.float32)
+            actions = np.asarray(actions, dtype=action_dtype(self.action_space))
             if actions.shape != (self.num_envs, *self.action_space.shape):  # type: ignore[misc]
                 raise ValueError(f"expected actions of shape {(self.num_envs, *self.action_space.shape)}, got {actions.shape}")  # type: ignore[misc]
         all_active = bool(active.all())

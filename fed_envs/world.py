@@ -36,6 +36,11 @@ def run_here(work: Callable[[Iterator[int]], None], rows: Sequence[int]) -> None
     work(iter(rows))
 
 
+def action_dtype(space: gymnasium.spaces.Space) -> type | np.dtype:
+    """In which actions arrive in :meth:`Batch.step`: float32, and whole numbers for choices."""
+    return np.float32 if isinstance(space, gymnasium.spaces.Box) else np.dtype(space.dtype)
+
+
 class Batch(ABC, Generic[EnvT]):
     """Environments of one world, stepped together. The arrays are overwritten by every step.
 
@@ -55,7 +60,7 @@ class Batch(ABC, Generic[EnvT]):
     def step(self, actions: np.ndarray, rows: Sequence[int], run: Runner = run_here) -> None:
         """Step the environments in ``rows`` and update the arrays there (other rows' rewards carry no meaning).
 
-        :param actions: ``(n, action_dim)`` float32, one row per environment of the batch
+        :param actions: ``(n, *action_space.shape)`` float32, or integers for choices, one row per environment of the batch
         :param rows: the environments to step
         :param run: how to go through the rows
         """
@@ -87,7 +92,7 @@ class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], ABC, Generic[ClientT]):
     script_version: ClassVar[int] = 1
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own interface)
     observation_space: gymnasium.spaces.Box
-    action_space: gymnasium.spaces.Box
+    action_space: gymnasium.spaces.Space
 
     def __init__(
         self,
@@ -129,7 +134,7 @@ class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], ABC, Generic[ClientT]):
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        action = np.asarray(action, dtype=np.float32)
+        action = np.asarray(action, dtype=action_dtype(self.action_space))
         if action.shape != self.action_space.shape:
             raise ValueError(f"expected an action of shape {self.action_space.shape}, got {action.shape}")
         batch = self._batch

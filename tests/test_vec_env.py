@@ -290,7 +290,6 @@ def test_own_environments_are_stepped_like_a_family():
         ({"family": "HopperHard", "num_threads": 0}, "num_threads must be at least 1"),
         ({"family": "Bandit2D", "render_mode": "human"}, "renders rgb_array, not 'human'"),
         ({"family": []}, "one function per client"),
-        ({"family": [lambda: gymnasium.make("Blackjack-v1")]}, "must be a Box"),
         ({"family": [lambda: gymnasium.make("CartPole-v1"), lambda: gymnasium.make("Pendulum-v1")]}, "share their spaces"),
         ({"family": [lambda: gymnasium.make("CartPole-v1")], "render_mode": "rgb_array"}, "their own render_mode"),
     ],

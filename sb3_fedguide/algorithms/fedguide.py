@@ -11,7 +11,6 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from fed_envs.state import State
 from sb3_fedguide.algorithms.fedguide_parts import begin_parts, held_parts, part_arrays, set_part_arrays
-from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.arguments import FederatedPPOArguments
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
@@ -312,13 +311,14 @@ class FedGuide(FederatedPPO):
     def _extra_losses(self, data: FederatedSamples, mean: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
         losses = {}
         if self.lambda_trust > 0:
-            kl = gaussian.kl_divergence(data.extras["old_mean"], self._old_log_std, mean, self.policy.log_std)
+            old = data.extras["old_mean"], self._old_log_std
+            kl = self.policy.distribution.kl_divergence(*old, mean, self.policy.log_std)
             losses["trust_loss"] = self.lambda_trust * kl.mean(dim=1)
         if "prior_weights" in data.extras:
             cross_entropy = -(data.extras["prior_weights"] * log_prob).mean(dim=1)
             losses["prior_loss"] = self._prior_weight * cross_entropy
         elif "prior_actions" in data.extras:
-            prior_log_prob = gaussian.log_prob(mean, self.policy.log_std, data.extras["prior_actions"])
+            prior_log_prob = self.policy.distribution.log_prob(mean, self.policy.log_std, data.extras["prior_actions"])
             losses["prior_loss"] = -self._prior_weight * prior_log_prob.mean(dim=1)
         return losses
 

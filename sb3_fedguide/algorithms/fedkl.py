@@ -6,7 +6,6 @@ import numpy as np
 import torch as th
 
 from sb3_fedguide.algorithms.fedprox import AnchoredFedAvg
-from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.anchors import actor_at
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.rollout_buffer import FederatedSamples
@@ -49,7 +48,7 @@ class FedKL(AnchoredFedAvg):
             )
         self.lambda_global = lambda_global
         self.lambda_local = lambda_local
-        self._log_stds: dict[str, th.Tensor] = {}
+        self._log_stds: dict[str, th.Tensor | None] = {}
         super().__init__(policy, env, **fedavg)
 
     @th.no_grad()
@@ -60,10 +59,10 @@ class FedKL(AnchoredFedAvg):
         if self.lambda_global > 0:
             actor, tensors = actor_at(self.policy, self.anchor)
             buffer.extras["broadcast_mean"] = actor(observations)
-            self._log_stds["broadcast"] = tensors["log_std"].detach()
+            self._log_stds["broadcast"] = None if self.policy.log_std is None else tensors["log_std"].detach()
         if self.lambda_local > 0:
             buffer.extras["old_mean"] = self.policy.actor_mean(observations)
-            self._log_stds["old"] = self.policy.log_std.detach().clone()
+            self._log_stds["old"] = None if self.policy.log_std is None else self.policy.log_std.detach().clone()
 
     def _extra_losses(self, data: FederatedSamples, mean: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
         losses = {}
@@ -72,7 +71,8 @@ class FedKL(AnchoredFedAvg):
             ("local_kl_loss", "old", self.lambda_local),
         ):
             if weight > 0:
-                kl = gaussian.kl_divergence(mean, self.policy.log_std, data.extras[f"{key}_mean"], self._log_stds[key])
+                other = data.extras[f"{key}_mean"], self._log_stds[key]
+                kl = self.policy.distribution.kl_divergence(mean, self.policy.log_std, *other)
                 losses[name] = weight * kl.mean(dim=1)
         return losses
 

@@ -6,7 +6,6 @@ import numpy as np
 import torch as th
 
 from sb3_fedguide.algorithms.fedavg import FedAvg
-from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.anchors import Parameters, actor_at, snapshot
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES, StackedActor
@@ -118,15 +117,18 @@ class FedSVRPGM(FedAvg):
         """How far the reference has fallen behind: ``pi_ref / pi_old`` has mean one, but may come from few samples."""
         buffer = self.rollout_buffer
         rows = [th.as_tensor(buffer.rows(array), device=self.device) for array in (buffer.observations, buffer.actions)]
-        ratio = th.exp(self._reference_log_prob(*rows) - th.as_tensor(buffer.rows(buffer.log_probs), device=self.device))
+        ratio = th.exp(self._at_reference(*rows)[0] - th.as_tensor(buffer.rows(buffer.log_probs), device=self.device))
         effective = ratio.sum(dim=1) ** 2 / (ratio**2).sum(dim=1) / buffer.n_rows
         present = th.as_tensor(self.present, device=self.device)
         self.logger.record("svrpg/effective_sample_share", float(effective[present].mean()))
         self.logger.record("svrpg/reference_ratio_max", float(ratio[present].max()))
 
-    def _reference_log_prob(self, observations: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    def _at_reference(self, observations: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Log-probabilities of the actions, ``(n_clients, batch)``, and entropies, ``(n_clients,)``, at theta_ref."""
         assert self._reference_actor is not None
-        return gaussian.log_prob(self._reference_actor(observations), self._reference_tensors["log_std"], actions)
+        distribution, log_std = self.policy.distribution, self._reference_tensors.get("log_std")
+        mean = self._reference_actor(observations)
+        return distribution.log_prob(mean, log_std, actions), distribution.entropy(mean, log_std)
 
     def _reference_gradients(self, data: FederatedSamples) -> dict[str, th.Tensor]:
         """g_ref by parameter: the ascent gradient of what :meth:`train` maximises, at theta_ref."""
@@ -135,11 +137,12 @@ class FedSVRPGM(FedAvg):
             centred = advantages - advantages.mean(dim=1, keepdim=True)
             advantages = centred / (advantages.std(dim=1, keepdim=True) + 1e-8)
         # Actions come from pi_old, so E[ratio] = 1 however old the reference is: no cap beyond the surrogate's own.
-        ratio = th.exp(self._reference_log_prob(data.observations, data.actions) - data.old_log_prob)
+        log_prob, entropy = self._at_reference(data.observations, data.actions)
+        ratio = th.exp(log_prob - data.old_log_prob)
         clip_range = self.clip_range(self._current_progress_remaining)
         clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
         objective = th.min(advantages * ratio, advantages * clipped).mean(dim=1)
-        objective = objective + self.ent_coef * gaussian.entropy(self._reference_tensors["log_std"])
+        objective = objective + self.ent_coef * entropy
         gradients = th.autograd.grad(objective.sum(), list(self._reference_tensors.values()))
         return dict(zip(self._reference_tensors, gradients, strict=True))
 

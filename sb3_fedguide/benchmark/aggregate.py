@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from gymnasium import spaces
 
 from fed_envs import Family, FederatedVecEnv
 from sb3_fedguide.common.evaluation import Evaluation, evaluate_federation
@@ -96,8 +97,15 @@ def random_actions(family: Family, n_episodes: int = 10) -> Evaluation:
     """What actions drawn uniformly from the action space return: the level that scores 0."""
     env = FederatedVecEnv(family, n_episodes, role=Role.EVAL_ENV)
     rng = np.random.default_rng(EVALUATION_SEED)
-    low, high = env.action_space.low, env.action_space.high  # type: ignore[attr-defined]
+    space = env.action_space
+    space.seed(EVALUATION_SEED)
+
+    def draw(obs: np.ndarray) -> np.ndarray:
+        if isinstance(space, spaces.Box):
+            return rng.uniform(space.low, space.high, (len(obs), *space.shape)).astype(np.float32)
+        return np.array([space.sample() for _ in obs])
+
     try:
-        return evaluate_federation(lambda obs: rng.uniform(low, high, (len(obs), *low.shape)).astype(np.float32), env)
+        return evaluate_federation(draw, env)
     finally:
         env.close()

@@ -157,8 +157,7 @@ def _check_server(deployment: ClientDeployment) -> None:
 
 
 def _try_site(deployment: ClientDeployment) -> None:
-    from sb3_fedguide.common.site import make_site
-    from sb3_fedguide.flower.client_app import SITE
+    from sb3_fedguide.common.site import SITE, make_site
 
     make_site(deployment.site, deployment.folder / SITE)
 

@@ -11,6 +11,7 @@ USAGE = """usage: fedguide COMMAND ...
 
   train      train a federation (the same as train.py)
   evaluate   evaluate a finished run's policies, client by client
+  export     clients' policies for use elsewhere: Stable-Baselines3, TorchScript, torch.export, ONNX
   benchmark  methods on families with seeds, as runs that can be interrupted, and tables of their results
   deploy     a federation over a network: certificates, keys, server and clients
   dataset    a Minari dataset for the offline stage from CSV or NPZ logs
@@ -33,6 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     commands: dict[str, Callable[[Sequence[str]], int]] = {
         "train": _train,
         "evaluate": _evaluate,
+        "export": _export,
         "benchmark": _benchmark,
         "deploy": _deploy,
         "dataset": _dataset,
@@ -53,6 +55,12 @@ def _train(argv: Sequence[str]) -> int:
 
 def _evaluate(argv: Sequence[str]) -> int:
     from sb3_fedguide.cli.evaluate import main
+
+    return main(argv)
+
+
+def _export(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.export import main
 
     return main(argv)
 

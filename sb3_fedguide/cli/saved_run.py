@@ -39,7 +39,11 @@ def read_run(folder: Path) -> tuple[dict[str, Any], Config, Family]:
 
 
 def _remedy(folder: Path, missing: str) -> str:
-    """What to do about the runs of earlier versions, which kept SB3's archive only."""
+    """What to do about a deployed client's folder, and about the runs of earlier versions, which kept SB3's archive only."""
+    from sb3_fedguide.common.site import PARAMETERS, SITE
+
+    if missing == "summary.json" and any((place / PARAMETERS).is_file() for place in (folder, folder / SITE)):
+        return "; it is a deployed client's, of whose policy 'fedguide export' makes an ordinary one to evaluate"
     if missing != "parameters.npz" or not (folder / "model.zip").is_file():
         return ""
     return (

@@ -23,11 +23,12 @@ def actor_at(policy: StackedMlpPolicy, parameters: Mapping[str, np.ndarray]) -> 
     """An actor of this policy's architecture with other parameters, on this policy's device.
 
     :param parameters: at least every actor parameter, as :func:`snapshot` names them
-    :return: the actor, and its trainable tensors under the policy's names, ``log_std`` among them
+    :return: the actor, and its trainable tensors under the policy's names, ``log_std`` among them where there is one
     """
     actor = policy.actor()
-    log_std = th.as_tensor(parameters["log_std"]).to(policy.log_std, copy=True).requires_grad_()
-    tensors: dict[str, th.Tensor] = {"log_std": log_std}
+    tensors: dict[str, th.Tensor] = {}
+    if policy.log_std is not None:
+        tensors["log_std"] = th.as_tensor(parameters["log_std"]).to(policy.log_std, copy=True).requires_grad_()
     with th.no_grad():
         for name, tensor in actor.named_parameters():
             full_name = name if name.startswith("action_net.") else f"mlp_extractor.{name}"

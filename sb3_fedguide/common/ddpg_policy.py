@@ -11,10 +11,16 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from sb3_fedguide.common.stacked_policy import StackedPolicy, check_spaces
+from sb3_fedguide.common.distributions import check_continuous
+from sb3_fedguide.common.stacked_policy import StackedPolicy, check_observations
 from sb3_fedguide.server.payload import DDPG_ACTOR, DDPG_CRITIC
 
 ACTOR_PREFIXES, CRITIC_PREFIXES = DDPG_ACTOR, DDPG_CRITIC
+
+
+def check_ddpg_actions(space: spaces.Space) -> None:
+    """:raises ValueError: for actions that no deterministic gradient reaches"""
+    check_continuous(space, "DDPG", "use a method on PPO: FedAvg, FedProx, FedKL, FedSVRPGM or Local")
 
 
 class BoundedActor(nn.Module):
@@ -68,7 +74,8 @@ class StackedDDPGPolicy(StackedPolicy, TD3Policy):
         optimizer_kwargs: dict[str, Any] | None = None,
         n_critics: int = 1,
     ) -> None:
-        check_spaces(observation_space, action_space)
+        check_observations(observation_space)
+        check_ddpg_actions(action_space)
         if n_critics != 1:
             raise ValueError(f"n_critics={n_critics}: DDPG has one critic per client; leave n_critics out")
         self.n_clients = n_clients

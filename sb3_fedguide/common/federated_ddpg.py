@@ -18,9 +18,8 @@ from torch import nn
 
 from fed_envs import FederatedVecEnv
 from fed_envs.state import State
-from sb3_fedguide.common.ddpg_policy import BoundedActor, StackedDDPGPolicy
+from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy, check_ddpg_actions
 from sb3_fedguide.common.environments import FederationLike, as_federated_env
-from sb3_fedguide.common.export import client_ddpg, export_program
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
@@ -116,6 +115,8 @@ class FederatedDDPG(Federation, DDPG):
     ) -> None:
         env = as_federated_env(env, n_envs_per_client, clients, num_threads)
         self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
+        if env is not None:
+            check_ddpg_actions(env.action_space)
         self.rollout_size = rollout_size
         self.noise_theta, self.noise_sigma, self.noise_dt = noise_theta, noise_sigma, noise_dt
         #: steps that each client has taken in its life, ``(n_clients,)``
@@ -327,20 +328,6 @@ class FederatedDDPG(Federation, DDPG):
             for index, value in zip(learned, per_client, strict=True):
                 self.record_client(self.client_ids[index], name, float(value))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-
-    def client(self, client_id: int) -> DDPG:
-        """Client ``client_id``'s policy as an ordinary ``stable_baselines3.DDPG`` that takes raw observations.
-
-        Networks, targets and normalisation are copied; Adam's moments and the replay buffer are not.
-
-        :raises ValueError: for a client that does not live here
-        """
-        return client_ddpg(self, self._position(client_id))
-
-    def export(self, client_id: int, path: str | Path) -> None:
-        actor: Any = self.client(client_id).policy.actor
-        policy = nn.Sequential(actor.features_extractor, BoundedActor(actor.mu, self.action_space))  # type: ignore[arg-type]
-        export_program(policy, self.observation_space.shape[0], path)  # type: ignore[index]
 
     def begin_lost_episodes(self) -> list[int]:
         ended = self._federated_env().lost

@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from fed_envs import FederatedVecEnv
-from sb3_fedguide.common import gaussian
+from sb3_fedguide.common.distributions import action_distribution, check_continuous
 from sb3_fedguide.common.environments import FederationLike, as_federated_env
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation, PolicyLike
@@ -110,6 +110,8 @@ class FederatedPPO(Federation, PPO):
         env = as_federated_env(env, n_envs_per_client, clients, num_threads)
         self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
         check_sizes(rollout_size, batch_size, self.n_envs_per_client)
+        if env is not None:
+            self._check_actions(env)
         self.rollout_size = rollout_size
         with warnings.catch_warnings():
             # SB3 takes the clients' rollouts for one and compares its size with a client's minibatch.
@@ -140,6 +142,15 @@ class FederatedPPO(Federation, PPO):
         if _init_setup_model:
             self._setup_model()
 
+    def _check_actions(self, env: FederatedVecEnv) -> None:
+        """:raises ValueError: where this method cannot learn the environments' kind of actions"""
+        action_distribution(env.action_space)
+        if self.uses_prior:
+            instead = "use FedAvg, FedProx, FedKL, FedSVRPGM or Local"
+            check_continuous(env.action_space, f"{type(self).__name__}'s prior over actions", instead)
+        if self.bc_weight > 0:
+            check_continuous(env.action_space, "behaviour cloning (bc_weight)", "leave bc_weight at 0")
+
     def _setup_model(self) -> None:
         assert self.seed is not None
         self._setup_lr_schedule()
@@ -149,7 +160,7 @@ class FederatedPPO(Federation, PPO):
             self.n_clients,
             self.n_envs_per_client,
             self.observation_space,  # type: ignore[arg-type]
-            self.action_space,  # type: ignore[arg-type]
+            action_distribution(self.action_space).action_dim,
         )
         kwargs = {**self.policy_kwargs, "n_clients": self.n_clients, "init_seed": integer_seed(self.seed, Role.INIT)}
         if self.partial:
@@ -177,7 +188,8 @@ class FederatedPPO(Federation, PPO):
     def _extra_losses(self, data: FederatedSamples, mean: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
         """Further loss terms by name, each ``(n_clients,)`` and already weighted.
 
-        :param mean: the current policies' means, ``(n_clients, batch, action_dim)``
+        :param mean: the current policies' means, or logits of discrete actions, ``(n_clients, batch, n_outputs)``; what
+            follows from them is in ``self.policy.distribution``
         :param log_prob: log-density of ``data.actions`` under the current policies, ``(n_clients, batch)``
         """
         return {}
@@ -205,8 +217,7 @@ class FederatedPPO(Federation, PPO):
         rollout_buffer.reset()
         callback.on_rollout_start()
         shape = (self.n_clients, self.n_envs_per_client)
-        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
-        noise = self._exploration_noise(n_rollout_steps)
+        distribution, noise = self.policy.distribution, self._exploration_noise(n_rollout_steps).unbind()
         actor_mean = self.policy.fixed_actor_mean()
         n_active = self._active_steps(env)
         raw_obs = self._last_obs.reshape(*shape, -1)  # type: ignore[union-attr]
@@ -215,10 +226,9 @@ class FederatedPPO(Federation, PPO):
         present = None if self.present.all() else self.present
         dones = starts
         for step in range(n_rollout_steps):
-            mean = actor_mean(th.as_tensor(obs, device=self.device)).cpu().numpy()
-            actions = mean + noise[step]
-            flat_actions = np.minimum(np.maximum(actions, low), high).reshape(env.num_envs, -1)  # np.clip is slower
-            new_raw_obs, raw_rewards, flat_dones, infos = env.step(flat_actions)
+            mean = actor_mean(th.as_tensor(obs, device=self.device))
+            actions = distribution.decide(mean + noise[step]).cpu().numpy()
+            new_raw_obs, raw_rewards, flat_dones, infos = env.step(distribution.executed(actions))
             self.num_timesteps += n_active
             callback.update_locals(locals())
             if not callback.on_step():
@@ -239,14 +249,19 @@ class FederatedPPO(Federation, PPO):
         callback.on_rollout_end()
         return True
 
-    def _exploration_noise(self, n_steps: int) -> np.ndarray:
-        """Every client's Gaussian noise for a whole rollout, from its own stream: ``(n_steps, n_clients, n_envs, dim)``."""
-        per_client = (n_steps, self.n_envs_per_client, self.action_space.shape[0])  # type: ignore[index]
+    def _exploration_noise(self, n_steps: int) -> th.Tensor:
+        """What makes the actors' outputs samples in a whole rollout, from each client's own stream.
+
+        :return: ``(n_steps, n_clients, n_envs, n_outputs)``
+        """
+        distribution, log_std = self.policy.distribution, self.policy.log_std
+        per_client = (n_steps, self.n_envs_per_client, distribution.n_outputs)
         draws = np.zeros((n_steps, self.n_clients, *per_client[1:]), dtype=np.float32)
         for index, rng in self.present_streams(Role.ACTION):
-            draws[:, index] = rng.standard_normal(per_client, dtype=np.float32)
-        std = self.policy.log_std.detach().exp().cpu().numpy()
-        return draws * std[None, :, None]
+            draws[:, index] = distribution.noise(rng, per_client)
+        if log_std is not None:
+            draws *= log_std.detach().exp().cpu().numpy()[None, :, None]
+        return th.as_tensor(draws, device=self.device)
 
     def _end_episode(self, index: int, info: dict[str, Any]) -> None:
         client, env = divmod(index, self.n_envs_per_client)
@@ -278,7 +293,7 @@ class FederatedPPO(Federation, PPO):
         buffer = self.rollout_buffer
         rows = th.as_tensor(buffer.rows(buffer.observations), device=self.device)
         actions = th.as_tensor(buffer.rows(buffer.actions), device=self.device)
-        log_probs = gaussian.log_prob(self.policy.actor_mean(rows), self.policy.log_std, actions)
+        log_probs = self.policy.distribution.log_prob(self.policy.actor_mean(rows), self.policy.log_std, actions)
         buffer.log_probs[:] = buffer.unrows(log_probs.cpu().numpy())
         buffer.values[:] = buffer.unrows(self.policy.values(rows).cpu().numpy())
         last_values = self.policy.values(th.as_tensor(obs, device=self.device)).cpu().numpy()
@@ -310,15 +325,15 @@ class FederatedPPO(Federation, PPO):
         self._update_learning_rate(self.policy.optimizer)
         clip_range = self.clip_range(self._current_progress_remaining)
         clip_range_vf = None if self.clip_range_vf is None else self.clip_range_vf(self._current_progress_remaining)
-        parameters = list(self.policy.parameters())
+        parameters, distribution = list(self.policy.parameters()), self.policy.distribution
         statistics = RoundStatistics()
         self._prepare_training()
         for _ in range(self.n_epochs):
             for data in self.rollout_buffer.get(self.batch_size, self.present_streams(Role.MINIBATCH), self.device):
                 mean = self.policy.actor_mean(data.observations)
                 values = self.policy.values(data.observations)
-                log_prob = gaussian.log_prob(mean, self.policy.log_std, data.actions)
-                entropy = gaussian.entropy(self.policy.log_std)
+                log_prob = distribution.log_prob(mean, self.policy.log_std, data.actions)
+                entropy = distribution.entropy(mean, self.policy.log_std)
 
                 advantages = data.advantages
                 if self.normalize_advantage and advantages.shape[1] > 1:

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3 import DDPG, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -25,7 +24,6 @@ from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
 from sb3_fedguide.common.environments import FederationLike as FederationLike
 from sb3_fedguide.common.environments import as_federated_env
 from sb3_fedguide.common.exchange import Exchange
-from sb3_fedguide.common.export import client_model, export_client
 from sb3_fedguide.common.faults import check_policies, in_round, warn_of_new_episodes
 from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize, check_normalize
 from sb3_fedguide.common.parameters import ParameterFiles
@@ -78,6 +76,7 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
         self.client_ids: list[int] = [] if env is None else list(env.client_ids)
         self.n_envs_per_client = 1 if env is None else env.n_envs_per_client
         self.family = None if env is None else env.family
+        self.raw_observation_space = None if env is None else env.raw_observation_space
         self.normalize = normalize
         self.bc_weight = bc_weight
         self.pretraining_config = PretrainingConfig.model_validate(pretraining or {})
@@ -178,6 +177,16 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
         for optimizer in self._optimizers():
             if isinstance(optimizer, ParticipationAdam):
                 optimizer.make_state()
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        """:raises ValueError: for a policy of which there is no stacked one, with what to do"""
+        if policy_name in self.policy_aliases:
+            return self.policy_aliases[policy_name]
+        reason = {
+            "MultiInputPolicy": "observations that are a Dict are flattened for it",
+            "CnnPolicy": "images are flattened for it, and there are no convolutions",
+        }.get(policy_name, "there is no other")
+        raise ValueError(f"policy={policy_name!r}: a federation's policy is 'MlpPolicy'; {reason}")
 
     def learn(
         self: SelfFederation,
@@ -329,33 +338,12 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
         observation = np.asarray(observation)
         if observation.ndim != 2 or len(observation) % self.n_clients:
             raise ValueError(
-                f"predict() takes observations of all {self.n_clients} clients, client by client, but got shape "
+                f"predict() takes flat observations of all {self.n_clients} clients, client by client, but got shape "
                 f"{observation.shape}; take one client's own model with client(k)"
             )
         split = observation.reshape(self.n_clients, -1, observation.shape[-1])
         normalized = self.normalizer.normalize_obs(split).reshape(observation.shape)
         return self.policy.predict(normalized, state, episode_start, deterministic)
-
-    def client(self, client_id: int) -> PPO | DDPG:
-        """Client ``client_id``'s policy as an ordinary ``stable_baselines3`` model that takes raw observations.
-
-        :raises ValueError: for a client that does not live here
-        """
-        return client_model(self, self._position(client_id))
-
-    def export(self, client_id: int, path: str | Path) -> None:
-        """Write client ``client_id``'s deterministic policy as a ``.pt2`` file: raw observations to executed actions.
-
-        ``torch.export.load(path).module()`` runs it where neither this package nor Stable-Baselines3 is installed.
-
-        :raises ValueError: for a client that does not live here
-        """
-        export_client(self, self._position(client_id), path)
-
-    def _position(self, client_id: int) -> int:
-        if client_id not in self.client_ids:
-            raise ValueError(f"no client {client_id} here; this federation holds the clients {self.client_ids}")
-        return self.client_ids.index(client_id)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "normalizer", "episode_infos", "engine"]

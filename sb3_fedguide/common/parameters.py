@@ -5,30 +5,32 @@ from __future__ import annotations
 import copy
 import io
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
+from gymnasium import spaces
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule
+from torch import nn
 
 from fed_envs.files import atomic_file
 from sb3_fedguide.common.array_files import array_mismatches, read_arrays, write_arrays
-from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
-from sb3_fedguide.common.stacked import to_arrays, to_tensors
+from sb3_fedguide.common.export import SETTINGS, ClientPolicies, ClientPolicy, Normalization
+from sb3_fedguide.common.normalization import Normalize
+from sb3_fedguide.common.spaces import describe_space, space_from
+from sb3_fedguide.common.stacked import client_state, to_arrays, to_tensors
 
 FORMAT, VERSION = "sb3_fedguide parameters", 1
 HEADER = "header"
 
 
-class ParameterFiles(BaseAlgorithm):
+class ParameterFiles(ClientPolicies):
     """Mixin for federations: their parameters as a file of plain arrays, beside SB3's archive."""
 
-    policy: Any
-    normalizer: FederatedNormalizer
     normalize: Normalize
     pretrained: bool
-    client_ids: list[int]
 
     def save(self, path: str | Path | io.BufferedIOBase, *args: Any, **kwargs: Any) -> None:
         """SB3's zip archive, as in SB3. To load it is to unpickle it: give models away with :meth:`export_parameters`.
@@ -113,7 +115,7 @@ def _write(model: ParameterFiles, path: str | Path) -> None:
     """
     header = {
         "format": FORMAT, "version": VERSION, "algorithm": type(model).__name__, "pretrained": model.pretrained,
-        "parts": model.parameter_parts(), **_identity(model),
+        "parts": model.parameter_parts(), **_identity(model), **_outside(model),
     }  # fmt: skip
     write_arrays(Path(path), {HEADER: np.array(json.dumps(header, allow_nan=False)), **model.parameter_arrays()})
 
@@ -124,11 +126,7 @@ def _read(model: ParameterFiles, path: str | Path) -> None:
     :raises ValueError: for a file that is absent, damaged, pickled, of another version, or of another federation; the
         message says what differs
     """
-    try:
-        arrays = read_arrays(Path(path))
-    except FileNotFoundError:
-        raise ValueError(f"there is no parameter file {path}") from None
-    header = _read_header(arrays.pop(HEADER, None), path)
+    header, arrays = _open(path)
     differences = [
         f"{name} is {header.get(name)!r} in the file and {value!r} here"
         for name, value in _identity(model).items()
@@ -142,10 +140,52 @@ def _read(model: ParameterFiles, path: str | Path) -> None:
             raise ValueError(f"{path} does not fit this {type(model).__name__}: {error}") from None
         differences = array_mismatches(arrays, blank.parameter_arrays()) or _broken(arrays)
     if differences:
-        raise ValueError(f"{path} does not fit this {type(model).__name__}: {'; '.join(differences)}")
+        raise ValueError(
+            f"{path} does not fit this {type(model).__name__}: {'; '.join(differences)}; for its policies alone, without a "
+            "federation, there is 'fedguide export'"
+        )
     model.begin_parts(header["parts"], header["pretrained"])
     model.set_parameter_arrays(arrays)
     model.pretrained = header["pretrained"]
+
+
+def read_policies(path: str | Path, replaced: dict[str, np.ndarray] | None = None) -> dict[int, ClientPolicy]:
+    """The policies in a file of :meth:`ParameterFiles.export_parameters`, by client; no federation is made.
+
+    :param replaced: parameters of policies to put in place of the file's, ``(n_clients, ...)`` each
+    :raises ValueError: for a file that is absent, damaged or of another version
+    """
+    header, arrays = _open(path)
+    put = {f"policy/{name}": array for name, array in (replaced or {}).items()}
+    mismatches = array_mismatches({**arrays, **put}, arrays)
+    if mismatches or (broken := _broken({**arrays, **put})):
+        raise ValueError(f"{path} and the policies to put in place of its own: {(mismatches or broken)[0]}")
+    policies = take_prefix({**arrays, **put}, "policy/")
+    if "spaces" not in header:
+        raise ValueError(
+            f"{path} is of an earlier version, which wrote no spaces; load it into a model of the same settings with "
+            "import_parameters(), and export_parameters() again"
+        )
+    try:
+        observations, actions = (space_from(header["spaces"][kind]) for kind in ("observation", "action"))
+        settings = {name: value for name, value in header["settings"].items() if name in SETTINGS[header["learner"]]}
+        moments = [arrays[f"normalizer/obs.{name}"] for name in ("mean", "var")]
+        found = {
+            int(client): ClientPolicy(
+                header["learner"],
+                observations,
+                actions,
+                getattr(nn, header["activation"]),
+                client_state(to_tensors(policies), index),
+                Normalization.of(*(moment[index] for moment in moments)) if header["normalize"] else None,
+                settings,
+            )
+            for index, client in enumerate(header["clients"])
+        }
+        next(iter(found.values())).to_sb3()  # the others have the same shapes
+    except (KeyError, IndexError, StopIteration, TypeError, AttributeError, ValueError, RuntimeError, AssertionError) as error:
+        raise ValueError(f"{path} is damaged: its header does not belong to its arrays ({error})") from None
+    return found
 
 
 def take_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
@@ -155,16 +195,53 @@ def take_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndar
 
 def _identity(model: ParameterFiles) -> dict[str, Any]:
     """What decides, beside the arrays, which actions a policy takes."""
-    policy = model.policy
-    space: Any = model.action_space
+    policy, space = model.policy, model.action_space
+    actions: dict[str, Any] = {"action_space": describe_space(space)}
+    if isinstance(space, spaces.Box):  # bounds are text, since one may be infinite
+        actions = {f"action_{name}": [str(bound) for bound in getattr(space, name).tolist()] for name in ("low", "high")}
     return {
         "policy": type(policy).__name__,
         "activation": policy.activation_fn.__name__,
         "clients": [int(client) for client in model.client_ids],
         "normalize": bool(model.normalize),
-        "action_low": [str(bound) for bound in space.low.tolist()],  # text, since a bound may be infinite
-        "action_high": [str(bound) for bound in space.high.tolist()],
+        **actions,
     }
+
+
+def _outside(model: ParameterFiles) -> dict[str, Any]:
+    """What a policy needs beside the arrays where there is no federation, see :func:`read_policies`."""
+    settings = {name: _plain(getattr(model, name)) for name in SETTINGS[model.learner]}
+    return {
+        "learner": model.learner,
+        "spaces": {
+            "observation": describe_space(model.client_observation_space),
+            "action": describe_space(model.action_space),
+        },
+        "settings": {name: value for name, value in settings.items() if _is_plain(value)},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """A number of JSON, also for a schedule that is constant; anything else as it is."""
+    if isinstance(value, FloatSchedule) and isinstance(value.value_schedule, ConstantSchedule):
+        value = value.value_schedule.val
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _is_plain(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and math.isfinite(value))
+
+
+def _open(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays.
+
+    :raises ValueError: for a file that is absent, damaged, pickled or of another version
+    """
+    try:
+        arrays = read_arrays(Path(path))
+    except FileNotFoundError:
+        raise ValueError(f"there is no parameter file {path}") from None
+    return _read_header(arrays.pop(HEADER, None), path), arrays
 
 
 def _read_header(array: np.ndarray | None, path: str | Path) -> dict[str, Any]:

@@ -13,16 +13,16 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
-from sb3_fedguide.common import gaussian
+from sb3_fedguide.common.distributions import action_distribution
 from sb3_fedguide.common.stacked import fixed_forward, stack_tensor
-from sb3_fedguide.common.stacked_policy import StackedPolicy, check_spaces
+from sb3_fedguide.common.stacked_policy import StackedPolicy, check_observations
 from sb3_fedguide.server.payload import PPO_ACTOR, PPO_CRITIC
 
 ACTOR_PREFIXES, CRITIC_PREFIXES = PPO_ACTOR, PPO_CRITIC
 
 
 class StackedActor(nn.Module):
-    """The clients' actors alone: ``(n_clients, batch, obs_dim)`` to mean actions ``(n_clients, batch, action_dim)``."""
+    """The clients' actors alone: ``(n_clients, batch, obs_dim)`` to means or logits, ``(n_clients, batch, n_outputs)``."""
 
     def __init__(self, policy_net: nn.Module, action_net: nn.Module) -> None:
         super().__init__()
@@ -44,8 +44,9 @@ class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
     :param init_seed: seed of the initial network, one for the whole federation
     :param net_arch: as in SB3; actor and critic may differ, ``dict(pi=[64, 64], vf=[64, 64])``
     :param activation_fn: activation module class
-    :param log_std_init: initial value of the state-independent log standard deviation
-    :raises ValueError: for spaces other than flat ``Box`` observations and ``Box`` actions
+    :param log_std_init: initial value of the state-independent log standard deviation, of continuous actions
+    :raises ValueError: for other than flat ``Box`` observations, and actions that
+        :func:`~sb3_fedguide.common.distributions.action_distribution` refuses
     """
 
     actor_prefixes = ACTOR_PREFIXES
@@ -66,9 +67,10 @@ class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        check_spaces(observation_space, action_space)
+        check_observations(observation_space)
         if use_sde:
             raise ValueError("use_sde=True is not supported by lockstep policies; use the default Gaussian exploration")
+        self.distribution = action_distribution(action_space)
         self.n_clients = n_clients
         self.init_seed = init_seed
         super().__init__(
@@ -92,7 +94,8 @@ class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
         self.mlp_extractor.value_net = self._stacked(self.mlp_extractor.value_net)
         self.action_net = self._stacked(self.action_net)
         self.value_net = self._stacked(self.value_net)
-        self.log_std = nn.Parameter(stack_tensor(self.log_std, self.n_clients))
+        std = nn.Parameter(stack_tensor(self.log_std, self.n_clients)) if self.distribution.has_log_std else None
+        self.register_parameter("log_std", std)
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def _build_mlp_extractor(self) -> None:
@@ -102,7 +105,10 @@ class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
         )
 
     def actor_mean(self, obs: th.Tensor) -> th.Tensor:
-        """Mean of the Gaussian policy; ``obs`` ``(n_clients, batch, obs_dim)`` to ``(n_clients, batch, action_dim)``."""
+        """What the distribution of actions is made of, for observations ``(n_clients, batch, obs_dim)``.
+
+        :return: a Gaussian's mean, or logits, ``(n_clients, batch, n_outputs)``
+        """
         return self.action_net(self.mlp_extractor.policy_net(obs))
 
     def fixed_actor_mean(self) -> Callable[[th.Tensor], th.Tensor]:
@@ -125,17 +131,22 @@ class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
         """Actions, values and log-probabilities, client-major and flat as SB3 returns them."""
         obs = self.split_clients(obs)
         mean = self.actor_mean(obs)
-        actions = mean if deterministic else mean + th.randn_like(mean) * self.log_std.exp().unsqueeze(1)
-        log_prob = gaussian.log_prob(mean, self.log_std, actions)
+        perturbed = mean
+        if not deterministic:
+            noise = self.distribution.noise_like(mean)
+            perturbed = mean + (noise if self.log_std is None else noise * self.log_std.exp().unsqueeze(1))
+        actions = self.distribution.decide(perturbed)
+        log_prob = self.distribution.log_prob(mean, self.log_std, actions)
         return actions.flatten(0, 1), self.values(obs).reshape(-1, 1), log_prob.flatten()
 
     def evaluate_actions(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
-        """Values, log-probabilities and entropy of stored actions, client-major and flat as SB3 returns them."""
+        """Values and log-probabilities of stored actions, and each client's mean entropy, client-major and flat as in SB3."""
         assert isinstance(obs, th.Tensor)
         obs = self.split_clients(obs)
         mean = self.actor_mean(obs)
-        log_prob = gaussian.log_prob(mean, self.log_std, actions.reshape(mean.shape))
-        entropy = gaussian.entropy(self.log_std).unsqueeze(1).expand_as(log_prob)
+        actions = actions.reshape(*mean.shape[:2], self.distribution.action_dim)
+        log_prob = self.distribution.log_prob(mean, self.log_std, actions)
+        entropy = self.distribution.entropy(mean, self.log_std).unsqueeze(1).expand_as(log_prob)
         return self.values(obs).reshape(-1, 1), log_prob.flatten(), entropy.flatten()
 
     def predict_values(self, obs: PyTorchObs) -> th.Tensor:

@@ -69,16 +69,17 @@ class FederatedRolloutBuffer:
     ``env * n_steps + step``, as ``stable_baselines3.RolloutBuffer`` flattens them.
 
     :param n_steps: steps per environment
+    :param action_dim: entries of an action
     """
 
     def __init__(
-        self, n_steps: int, n_clients: int, n_envs_per_client: int, observation_space: spaces.Box, action_space: spaces.Box
+        self, n_steps: int, n_clients: int, n_envs_per_client: int, observation_space: spaces.Box, action_dim: int
     ) -> None:
         self.n_steps, self.n_clients, self.n_envs_per_client = n_steps, n_clients, n_envs_per_client
         shape = (n_steps, n_clients, n_envs_per_client)
         self.raw_observations = np.zeros((*shape, *observation_space.shape), dtype=np.float32)
         self.observations = np.zeros_like(self.raw_observations)
-        self.actions = np.zeros((*shape, *action_space.shape), dtype=np.float32)
+        self.actions = np.zeros((*shape, action_dim), dtype=np.float32)  # a choice's number is exact up to 2^24
         self.rewards = np.zeros(shape, dtype=np.float32)
         self.episode_starts = np.zeros(shape, dtype=np.float32)
         self.values = np.zeros(shape, dtype=np.float32)

@@ -34,6 +34,8 @@ Answer = tuple[Payload, dict[str, Any]]
 
 #: What a client has learned when the run is over, in its folder: see :meth:`Federation.export_parameters`.
 PARAMETERS = "parameters.npz"
+#: In the folder of a deployed client, that of its :class:`Site`.
+SITE = "site"
 
 
 class Site:
@@ -99,8 +101,8 @@ class Site:
     def facts(self) -> dict[str, Any]:
         """What this client says of itself when it joins."""
         model = self.model
-        obs_dim, action_dim = (space.shape[0] for space in (model.observation_space, model.action_space))  # type: ignore[index]
-        shapes = {"observations": [obs_dim], "actions": [action_dim], **model.upload_shapes()}
+        sizes = {"observations": model.observation_space, "actions": model.action_space}
+        shapes = {**{name: list(space.shape or ()) for name, space in sizes.items()}, **model.upload_shapes()}
         trunk = model.offline_stage().trunk_settings() if model.uses_prior else None
         return {**self._identity(), "client": self.client_id, "shapes": shapes, "trunk": trunk}
 

@@ -55,11 +55,10 @@ class StackedPolicy(BasePolicy):
             parameters[name][index].copy_(th.as_tensor(array))
 
 
-def check_spaces(observation_space: spaces.Space, action_space: spaces.Space) -> None:
-    """:raises ValueError: for spaces other than flat ``Box`` observations and ``Box`` actions"""
-    for name, space in (("observation", observation_space), ("action", action_space)):
-        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-            raise ValueError(
-                f"a federation needs one-dimensional Box spaces, but the {name} space is {space}; "
-                "flatten it (gymnasium.wrappers.FlattenObservation) or use a continuous action space"
-            )
+def check_observations(space: spaces.Space) -> None:
+    """:raises ValueError: for other than flat ``Box`` observations"""
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        raise ValueError(
+            f"a federation's policy needs one-dimensional Box observations, but the observation space is {space}; flatten it "
+            "(gymnasium.wrappers.FlattenObservation)"
+        )

@@ -14,9 +14,9 @@ from flwr.proto.runtime_pb2 import AcquireTaskRequest
 from flwr.supercore.constant import TaskType
 from flwr.supercore.runtime import RuntimeHttpClient
 
-from sb3_fedguide.common.site import PARAMETERS
+from sb3_fedguide.common.site import PARAMETERS, SITE
 from sb3_fedguide.flower.certificates import LOOPBACK
-from sb3_fedguide.flower.client_app import FINISHED, SITE, app
+from sb3_fedguide.flower.client_app import FINISHED, app
 from sb3_fedguide.flower.processes import FlowerProcess, environment, free_port, runtime_version
 
 _POLL_SECONDS = 0.2

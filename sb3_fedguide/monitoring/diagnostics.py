@@ -10,7 +10,6 @@ import numpy as np
 import torch as th
 
 from sb3_fedguide.algorithms.fedguide import FedGuide
-from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.anchors import Parameters, actor_at, snapshot
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.evaluation import FederatedEvalCallback
@@ -37,9 +36,8 @@ def policy_divergences(model: FederatedPPO, n_states: int = N_STATES) -> np.ndar
     chosen = np.linspace(0, buffer.n_rows - 1, min(n_states, buffer.n_rows)).astype(int)
     states = th.as_tensor(buffer.rows(buffer.observations)[:, chosen], device=model.device)
     actor, tensors = actor_at(model.policy, average_actor(model))
-    divergence = gaussian.kl_divergence(
-        model.policy.actor_mean(states), model.policy.log_std, actor(states), tensors["log_std"]
-    )
+    own = model.policy.actor_mean(states), model.policy.log_std
+    divergence = model.policy.distribution.kl_divergence(*own, actor(states), tensors.get("log_std"))
     return divergence.mean(dim=1).cpu().numpy()[model.present]
 
 
