@@ -18,8 +18,9 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide.common import gaussian
+from sb3_fedguide.common.environments import FederationLike, as_federated_env
 from sb3_fedguide.common.faults import check_experience
-from sb3_fedguide.common.federation import Federation, FederationLike, PolicyLike, as_federated_env
+from sb3_fedguide.common.federation import Federation, PolicyLike
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
@@ -142,13 +143,6 @@ class FederatedPPO(Federation, PPO):
         assert self.seed is not None
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        self.rollout_buffer = FederatedRolloutBuffer(
-            self.n_steps,
-            self.n_clients,
-            self.n_envs_per_client,
-            self.observation_space,  # type: ignore[arg-type]
-            self.action_space,  # type: ignore[arg-type]
-        )
         kwargs = {**self.policy_kwargs, "n_clients": self.n_clients, "init_seed": integer_seed(self.seed, Role.INIT)}
         if self.partial:
             kwargs.update(optimizer_class=ParticipationAdam, optimizer_kwargs={"eps": 1e-5})  # SB3's epsilon for Adam
@@ -163,7 +157,21 @@ class FederatedPPO(Federation, PPO):
             norm_obs=self.normalize,
             norm_reward=self.normalize,
         )
+        self._fit_copies()
         self._start_server()
+
+    def _fit_copies(self) -> None:
+        check_sizes(self.rollout_size, self.batch_size, self.n_envs_per_client)
+        self.n_steps = self.rollout_size // self.n_envs_per_client
+        self.n_envs = self.n_clients * self.n_envs_per_client
+        self.normalizer.reset_returns(self.n_envs_per_client)
+        self.rollout_buffer = FederatedRolloutBuffer(
+            self.n_steps,
+            self.n_clients,
+            self.n_envs_per_client,
+            self.observation_space,  # type: ignore[arg-type]
+            self.action_space,  # type: ignore[arg-type]
+        )
 
     def _prepare_training(self) -> None:
         """After the rollout, before the first minibatch: compute what the extra losses need, once per round."""
@@ -210,28 +218,30 @@ class FederatedPPO(Federation, PPO):
         obs = self.normalizer.normalize_obs(raw_obs)
         starts = self._last_episode_starts.reshape(shape)
         present = None if self.present.all() else self.present
-        dones = starts
-        for step in range(n_rollout_steps):
+        for n_steps in range(n_rollout_steps):
             mean = actor_mean(th.as_tensor(obs, device=self.device)).cpu().numpy()
-            actions = mean + noise[step]
-            flat_actions = np.minimum(np.maximum(actions, low), high).reshape(env.num_envs, -1)  # np.clip is slower
-            new_raw_obs, raw_rewards, flat_dones, infos = env.step(flat_actions)
+            drawn = mean + noise[n_steps]
+            actions = drawn.reshape(env.num_envs, -1)
+            clipped_actions = np.minimum(np.maximum(actions, low), high)  # np.clip is slower
+            new_obs, rewards, dones, infos = env.step(clipped_actions)  # names as in SB3, whose callbacks read them
             self.num_timesteps += n_active
             callback.update_locals(locals())
-            if not callback.on_step():
-                return False
-            dones = flat_dones.reshape(shape)
-            next_raw = new_raw_obs.reshape(*shape, -1)  # type: ignore[union-attr]
+            goes_on = callback.on_step()
+            next_raw = new_obs.reshape(*shape, -1)  # type: ignore[union-attr]
+            ends = dones.reshape(shape)
             self.normalizer.update_obs(next_raw, present)
-            rewards = self.normalizer.scale_reward(raw_rewards.reshape(shape), dones, present)
-            rollout_buffer.add(raw_obs, obs, actions, rewards, starts)
-            for index in np.flatnonzero(flat_dones):
+            scaled_rewards = self.normalizer.scale_reward(rewards.reshape(shape), ends, present)
+            rollout_buffer.add(raw_obs, obs, drawn, scaled_rewards, starts)
+            for index in np.flatnonzero(dones):
                 self._end_episode(int(index), infos[index])
-            raw_obs, obs, starts = next_raw, self.normalizer.normalize_obs(next_raw), dones
+            raw_obs, obs, starts = next_raw, self.normalizer.normalize_obs(next_raw), ends
             if present is not None:  # a client that was away still has its episode to begin
-                starts = np.where(present[:, None], dones, rollout_buffer.episode_starts[step] > 0)
-        self._last_obs, self._last_episode_starts = new_raw_obs, np.asarray(starts, dtype=bool).reshape(-1)  # type: ignore[assignment]
-        self._finish_rollout(raw_obs, obs, dones)
+                starts = np.where(present[:, None], ends, rollout_buffer.episode_starts[n_steps] > 0)
+            if not goes_on or n_steps + 1 == n_rollout_steps:  # where the next rollout begins, whatever ends this one
+                self._last_obs, self._last_episode_starts = new_obs, np.asarray(starts, dtype=bool).reshape(-1)  # type: ignore[assignment]
+            if not goes_on:
+                return False
+        self._finish_rollout(raw_obs, obs, ends)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
@@ -247,8 +257,7 @@ class FederatedPPO(Federation, PPO):
 
     def _end_episode(self, index: int, info: dict[str, Any]) -> None:
         client, env = divmod(index, self.n_envs_per_client)
-        if "episode" in info:
-            self.episode_infos[client].append(info["episode"])
+        self.note_episode(client, info)
         if info.get("TimeLimit.truncated", False):
             final = np.asarray(info["terminal_observation"])
             self.rollout_buffer.add_truncation(client, env, final, self.normalizer.normalize_obs(final, client))

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import time
 from abc import abstractmethod
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3 import DDPG, PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.vec_env import VecEnv
 
 from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback, RoundProgressCallback, round_callbacks
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
+from sb3_fedguide.common.environments import FederatedEnvironments
+from sb3_fedguide.common.environments import FederationLike as FederationLike
+from sb3_fedguide.common.episodes import EpisodeStatistics
 from sb3_fedguide.common.export import client_model, export_client
 from sb3_fedguide.common.faults import check_policies, in_round
 from sb3_fedguide.common.normalization import FederatedNormalizer
@@ -42,11 +40,10 @@ if TYPE_CHECKING:
     from sb3_fedguide.engines.engine import Engine
 
 PolicyLike = str | type[ActorCriticPolicy]
-FederationLike = str | Path | Any | Sequence[Callable[[], gym.Env]]
 SelfFederation = TypeVar("SelfFederation", bound="Federation")
 
 
-class Federation(WarmStart, ParameterFiles, Resumable):
+class Federation(FederatedEnvironments, EpisodeStatistics, WarmStart, ParameterFiles, Resumable):
     """Mixin for SB3 algorithms that train all clients of a family in lockstep.
 
     A method names the server's side in :attr:`server_method` (or makes it, with :meth:`_make_strategy`), and defines the
@@ -98,13 +95,6 @@ class Federation(WarmStart, ParameterFiles, Resumable):
         self.pretraining_bytes = (0, 0)
         self.strategy: Strategy | None = None
         self._streams: dict[Role, list[np.random.Generator]] = {}
-
-    @staticmethod
-    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        """Accept whatever a federation can be made of wherever SB3 takes an environment, as in ``load(path, env=...)``."""
-        wrapped = as_federated_env(env)
-        assert wrapped is not None
-        return BaseAlgorithm._wrap_env(wrapped, verbose, monitor_wrapper)
 
     @property
     def n_clients(self) -> int:
@@ -274,8 +264,12 @@ class Federation(WarmStart, ParameterFiles, Resumable):
         """
         try:
             return self._train_round(callbacks)
-        except ClientError:
-            self._check_experience()  # what an environment returned explains an action that is not finite
+        except BaseException as error:
+            try:
+                if isinstance(error, ClientError):
+                    self._check_experience()  # what an environment returned explains an action that is not finite
+            finally:
+                self._last_obs = None  # the environments stand in the middle of a step: the next learn() resets them
             raise
 
     @abstractmethod
@@ -301,34 +295,8 @@ class Federation(WarmStart, ParameterFiles, Resumable):
             self.normalizer.reset_returns()
             self.normalizer.update_obs(self._last_obs.reshape(self.n_clients, self.n_envs_per_client, -1))  # type: ignore
         if environments_were_reset or not hasattr(self, "episode_infos"):
-            self.episode_infos: list[deque[dict[str, float]]] = [
-                deque(maxlen=self._stats_window_size) for _ in range(self.n_clients)
-            ]
-
-    def mean_episode_return(self) -> float:
-        """Average over clients of each one's mean return over its last finished training episodes."""
-        means = [np.mean([info["r"] for info in infos]) for infos in self.episode_infos if infos]
-        return float(np.mean(means)) if means else float("nan")
-
-    def dump_logs(self, iteration: int = 0) -> None:
-        """Write one round's log: each client is averaged first, so that those with short episodes do not dominate."""
-        for client, infos in zip(self.client_ids, self.episode_infos, strict=True):
-            if infos:
-                self.record_client(client, "ep_rew_mean", float(np.mean([info["r"] for info in infos])))
-        lengths = [np.mean([info["l"] for info in infos]) for infos in self.episode_infos if infos]
-        if lengths:
-            self.logger.record("rollout/ep_rew_mean", self.mean_episode_return())
-            self.logger.record("rollout/ep_len_mean", float(np.mean(lengths)))
-        elapsed = max((time.time_ns() - self.start_time) / 1e9, 1e-9)
-        self.logger.record("time/round", iteration)
-        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
-        self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(step=self.num_timesteps)
-
-    def record_client(self, client_id: int, key: str, value: float) -> None:
-        """Log one client's value; kept off the terminal, where long keys collide and eight clients drown the rest."""
-        self.logger.record(f"client_{client_id}/{key}", value, exclude=("stdout", "log"))
+            self.begin_episodes()
+        self.gather_episodes()
 
     def predict(  # type: ignore[override]
         self,
@@ -377,23 +345,3 @@ class Federation(WarmStart, ParameterFiles, Resumable):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer", "normalizer"], []
-
-
-def as_federated_env(
-    env: FederationLike | None,
-    n_envs_per_client: int = 1,
-    clients: Sequence[int] | None = None,
-    num_threads: int = 1,
-) -> FederatedVecEnv | None:
-    """A ``FederatedVecEnv`` from a family name, metadata file, ``Family`` or list of factories.
-
-    :raises ValueError: for an environment that holds a single client
-    """
-    if env is None or isinstance(env, FederatedVecEnv):
-        return env
-    if isinstance(env, VecEnv | gym.Env):
-        raise ValueError(
-            f"a federation needs one environment per client, but got a single {type(env).__name__}; pass a family name, "
-            "a metadata file, a fed_envs.FederatedVecEnv or a list of environment factories"
-        )
-    return FederatedVecEnv(env, n_envs_per_client=n_envs_per_client, clients=clients, num_threads=num_threads)

@@ -43,14 +43,6 @@ class ParameterFiles(BaseAlgorithm):
         with atomic_file(target, "wb") as file:
             super().save(file, *args, **kwargs)  # type: ignore[arg-type]
 
-    @classmethod
-    def load(cls, path: str | Path | io.BufferedIOBase, *args: Any, **kwargs: Any) -> Any:
-        """As in SB3, whose archive is unpickled: it can execute any code, so load only what you trust.
-
-        :meth:`import_parameters` reads a file of :meth:`export_parameters` from anybody.
-        """
-        return super().load(path, *args, **kwargs)
-
     def export_parameters(self, path: str | Path) -> None:
         """Write what was learned as plain arrays with a JSON header (npz, no pickle): every client's policy and
         normalisation, and the offline stage's priors, experts and values where there are any.

@@ -110,6 +110,7 @@ class Engine(ABC):
         for k, reply in replies.items():
             if reply.observations is not None:
                 model.rollout_buffer.observations[:, self.groups[k]] = reply.observations  # type: ignore[attr-defined]
+        model.gather_episodes()
         self._record(model, replies)
         callbacks.on_rollout_end()
         return True
