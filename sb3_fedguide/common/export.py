@@ -14,11 +14,22 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federation import Federation
+
+
+PPO_SETTINGS = (
+    "learning_rate", "batch_size", "n_epochs", "gamma", "gae_lambda", "clip_range", "clip_range_vf", "normalize_advantage",
+    "ent_coef", "vf_coef", "max_grad_norm", "verbose", "seed",
+)  # fmt: skip
+DDPG_SETTINGS = (
+    "learning_rate", "buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq", "gradient_steps",
+    "verbose", "seed",
+)  # fmt: skip
 
 
 class NormalizedObservation(BaseFeaturesExtractor):
@@ -91,6 +102,22 @@ def normalized_features(normalizer: FederatedNormalizer, index: int) -> dict[str
     return {"features_extractor_class": NormalizedObservation, "features_extractor_kwargs": kwargs}
 
 
+def _network(federation: Federation, index: int) -> dict[str, Any]:
+    """``policy_kwargs`` of the client at position ``index`` that every kind of policy has."""
+    policy: Any = federation.policy
+    given = {name: getattr(policy, name) for name in ("net_arch", "activation_fn", "optimizer_class", "optimizer_kwargs")}
+    if given["optimizer_class"] is ParticipationAdam:  # Adam, for clients that come and go
+        given["optimizer_class"] = th.optim.Adam
+    return {**given, **normalized_features(federation.normalizer, index)}
+
+
+def _set_up(model: PPO | DDPG, federation: Federation) -> None:
+    """Make the networks and buffers of a model without environments."""
+    model.observation_space, model.action_space = federation.observation_space, federation.action_space
+    model.n_envs = 1
+    model._setup_model()
+
+
 def client_model(federation: Federation, index: int) -> PPO:
     """The client at position ``index`` as a ``stable_baselines3.PPO``; ``set_env`` gives it an environment to train in.
 
@@ -98,26 +125,19 @@ def client_model(federation: Federation, index: int) -> PPO:
     """
     policy = federation.policy
     assert isinstance(policy, StackedMlpPolicy)
-    policy_kwargs: dict[str, Any] = {
-        "net_arch": policy.net_arch,
-        "activation_fn": policy.activation_fn,
-        "log_std_init": policy.log_std_init,
-        **normalized_features(federation.normalizer, index),
-    }
-    settings = {name: getattr(federation, name) for name in ("n_steps", "batch_size", "gamma", "gae_lambda", "n_epochs")}
+    policy_kwargs = {name: getattr(policy, name) for name in ("log_std_init", "ortho_init")}
+    settings: dict[str, Any] = {name: getattr(federation, name) for name in PPO_SETTINGS}
     model = PPO(
         "MlpPolicy",
         None,  # type: ignore[arg-type]
-        learning_rate=federation.learning_rate,
-        policy_kwargs=policy_kwargs,
-        seed=federation.seed,
+        n_steps=federation.rollout_size,  # in one environment
+        policy_kwargs={**policy_kwargs, **_network(federation, index)},
+        stats_window_size=federation._stats_window_size,
         device="cpu",
         _init_setup_model=False,
         **settings,
     )
-    model.observation_space, model.action_space = federation.observation_space, federation.action_space
-    model.n_envs = 1
-    model._setup_model()
+    _set_up(model, federation)
     state = policy.client_state_dict(index)
     model.policy.load_state_dict({**model.policy.state_dict(), **state})
     return model
@@ -127,28 +147,18 @@ def client_ddpg(federation: FederatedDDPG, index: int) -> DDPG:
     """As :func:`client_model`, of a federation of deterministic policies: the networks and their targets are copied."""
     policy = federation.policy
     zeros = np.zeros(federation.action_space.shape or ())
-    settings: dict[str, Any] = {
-        name: getattr(federation, name)
-        for name in ("buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq", "gradient_steps")
-    }
+    settings: dict[str, Any] = {name: getattr(federation, name) for name in DDPG_SETTINGS}
     noise = federation.noise
     model = DDPG(
         "MlpPolicy",
         None,  # type: ignore[arg-type]
-        learning_rate=federation.learning_rate,
         action_noise=OrnsteinUhlenbeckActionNoise(zeros, np.full_like(zeros, noise.sigma), noise.theta, noise.dt),
-        policy_kwargs={
-            "net_arch": policy.net_arch,
-            "activation_fn": policy.activation_fn,
-            **normalized_features(federation.normalizer, index),
-        },
-        seed=federation.seed,
+        policy_kwargs=_network(federation, index),
         device="cpu",
         _init_setup_model=False,
         **settings,
     )
-    model.observation_space, model.action_space = federation.observation_space, federation.action_space
-    model.n_envs = 1
-    model._setup_model()
+    model._stats_window_size = federation._stats_window_size
+    _set_up(model, federation)
     model.policy.load_state_dict({**model.policy.state_dict(), **policy.client_state_dict(index)})
     return model

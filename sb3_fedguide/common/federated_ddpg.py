@@ -24,6 +24,7 @@ from sb3_fedguide.common.environments import FederationLike, as_federated_env, c
 from sb3_fedguide.common.export import client_ddpg, export_program
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation
+from sb3_fedguide.common.keywords import check_policy, check_policy_keywords
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.participation import ParticipationAdam
@@ -32,6 +33,7 @@ from sb3_fedguide.common.seeding import Role, integer_seed
 from sb3_fedguide.common.training_log import RoundStatistics
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
 from sb3_fedguide.server.validation import UPLOAD_BOUND
+from sb3_fedguide.settings.ranges import check_ranges
 
 
 class FederatedDDPG(Federation, DDPG):
@@ -114,6 +116,8 @@ class FederatedDDPG(Federation, DDPG):
         device: th.device | str = "cpu",
         _init_setup_model: bool = True,
     ) -> None:
+        check_ranges(locals())
+        check_policy(policy, self.policy_aliases, type(self))
         env = as_federated_env(env, n_envs_per_client, clients, num_threads)
         self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
         self.rollout_size = rollout_size
@@ -132,7 +136,7 @@ class FederatedDDPG(Federation, DDPG):
             train_freq=train_freq,
             gradient_steps=gradient_steps,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
+            policy_kwargs=dict(policy_kwargs or {}),  # SB3 adds to it
             verbose=verbose,
             seed=int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else seed,
             device=device,
@@ -145,6 +149,8 @@ class FederatedDDPG(Federation, DDPG):
 
     def _setup_model(self) -> None:
         assert self.seed is not None
+        check_ranges(vars(self))  # those of subclasses, and of load()
+        check_policy_keywords(self.policy_class, self.policy_kwargs)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         if self.replay_buffer is None:
@@ -398,15 +404,7 @@ def _check_settings(model: FederatedDDPG) -> None:
         raise ValueError(
             f"gradient_steps={model.gradient_steps} must be at least 1, or -1 for as many as there are new transitions"
         )
-    if model.batch_size < 1 or model.learning_starts < 0:
-        raise ValueError(
-            f"batch_size={model.batch_size} must be at least 1 and learning_starts={model.learning_starts} at least 0"
-        )
     if model.buffer_size <= model.learning_starts:
         raise ValueError(
             f"buffer_size={model.buffer_size} must be larger than learning_starts={model.learning_starts}; both are per client"
         )
-    if not 0 < model.tau <= 1:
-        raise ValueError(f"tau={model.tau} must lie in (0, 1]")
-    if min(model.noise_theta, model.noise_sigma) < 0 or model.noise_dt <= 0:
-        raise ValueError("noise_theta and noise_sigma must not be negative, and noise_dt must be positive")

@@ -21,6 +21,7 @@ from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.environments import FederationLike, as_federated_env
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation, PolicyLike
+from sb3_fedguide.common.keywords import check_policy, check_policy_keywords
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
@@ -30,6 +31,7 @@ from sb3_fedguide.common.stacked import clip_grad_norm_per_client
 from sb3_fedguide.common.training_log import RoundStatistics, record_training
 from sb3_fedguide.offline.pretraining import PretrainingConfig
 from sb3_fedguide.server.validation import UPLOAD_BOUND
+from sb3_fedguide.settings.ranges import check_ranges
 
 
 class FederatedPPO(Federation, PPO):
@@ -106,6 +108,8 @@ class FederatedPPO(Federation, PPO):
         device: th.device | str = "cpu",
         _init_setup_model: bool = True,
     ) -> None:
+        check_ranges(locals())
+        check_policy(policy, self.policy_aliases, type(self))
         env = as_federated_env(env, n_envs_per_client, clients, num_threads)
         self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
         check_sizes(rollout_size, batch_size, self.n_envs_per_client)
@@ -141,6 +145,8 @@ class FederatedPPO(Federation, PPO):
 
     def _setup_model(self) -> None:
         assert self.seed is not None
+        check_ranges(vars(self))  # those of subclasses, and of load()
+        check_policy_keywords(self.policy_class, self.policy_kwargs)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         kwargs = {**self.policy_kwargs, "n_clients": self.n_clients, "init_seed": integer_seed(self.seed, Role.INIT)}

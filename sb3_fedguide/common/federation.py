@@ -23,6 +23,7 @@ from sb3_fedguide.common.environments import FederationLike as FederationLike
 from sb3_fedguide.common.episodes import EpisodeStatistics
 from sb3_fedguide.common.export import client_model, export_client
 from sb3_fedguide.common.faults import check_policies, in_round
+from sb3_fedguide.common.keywords import CheckedKeywords
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.parameters import ParameterFiles
 from sb3_fedguide.common.participation import ParticipationAdam
@@ -32,9 +33,9 @@ from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.common.warm_start import WarmStart
 from sb3_fedguide.offline.pretraining import PretrainingConfig
 from sb3_fedguide.server.build import COMMON, find_method, make_strategy
-from sb3_fedguide.server.participants import check_fraction, draw_participants, n_participants
+from sb3_fedguide.server.participants import draw_participants, n_participants
 from sb3_fedguide.server.strategy import Payload, Strategy
-from sb3_fedguide.server.validation import UPLOAD_BOUND, check_bound
+from sb3_fedguide.server.validation import UPLOAD_BOUND
 
 if TYPE_CHECKING:
     from sb3_fedguide.engines.engine import Engine
@@ -43,7 +44,7 @@ PolicyLike = str | type[ActorCriticPolicy]
 SelfFederation = TypeVar("SelfFederation", bound="Federation")
 
 
-class Federation(FederatedEnvironments, EpisodeStatistics, WarmStart, ParameterFiles, Resumable):
+class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, WarmStart, ParameterFiles, Resumable):
     """Mixin for SB3 algorithms that train all clients of a family in lockstep.
 
     A method names the server's side in :attr:`server_method` (or makes it, with :meth:`_make_strategy`), and defines the
@@ -68,9 +69,6 @@ class Federation(FederatedEnvironments, EpisodeStatistics, WarmStart, ParameterF
         upload_bound: float | None = UPLOAD_BOUND,
     ) -> None:
         """Called by a subclass's constructor, before SB3's."""
-        check_fraction(client_fraction)
-        if not 0.0 <= bc_weight <= 1.0:
-            raise ValueError(f"bc_weight={bc_weight} must lie in [0, 1]")
         self.client_ids: list[int] = [] if env is None else list(env.client_ids)
         self.n_envs_per_client = 1 if env is None else env.n_envs_per_client
         self.family = None if env is None else env.family
@@ -79,7 +77,6 @@ class Federation(FederatedEnvironments, EpisodeStatistics, WarmStart, ParameterF
         self.pretraining_config = PretrainingConfig.model_validate(pretraining or {})
         self.cache_dir = cache_dir
         self.client_fraction = client_fraction
-        check_bound(upload_bound)
         self.upload_bound = upload_bound
         #: environment steps that one step of a round counts; by default those of the clients that take part here
         self.steps_at_once: int | None = None
