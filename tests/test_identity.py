@@ -70,7 +70,7 @@ def test_others_are_refused(env, message, tmp_path):
 
 def test_functions_of_ones_own_do_not_stand_for_a_family(point_envs, tmp_path):
     path = saved(make(env=point_envs(4)), tmp_path)
-    with pytest.raises(ValueError, match="family Bandit2D .* federation of functions of your own"):
+    with pytest.raises(ValueError, match=r"family Bandit2D .* federation of functions of your own"):
         Local.load(path, env="Bandit2D")
     assert Local.load(path, env=point_envs(4)).learn(1).num_timesteps == 160
 

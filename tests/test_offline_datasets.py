@@ -73,7 +73,11 @@ def test_episodes_that_begin_where_others_ended_are_told_apart(tmp_path: Path) -
     write_minari(tmp_path, "cut-v0", data, *space, {})
     again = read_minari(tmp_path / "data")
     assert_same(again, data)
-    assert again.content_hash == data.content_hash != OfflineData(zeros, np.zeros((6, 1)), np.arange(6.0), zeros, cut).content_hash
+    assert (
+        again.content_hash
+        == data.content_hash
+        != OfflineData(zeros, np.zeros((6, 1)), np.arange(6.0), zeros, cut).content_hash
+    )
     one = tiny_data()  # here the observations say it already: one content, with or without
     assert OfflineData(**one.arrays(), truncations=one.episode_ends).content_hash == one.content_hash
 
@@ -87,7 +91,7 @@ def test_actions_outside_their_space_are_refused(tmp_path: Path) -> None:
         write_minari(tmp_path / name, name, OfflineData(**{**data.arrays(), "actions": actions}), *space, {})
         path = str(tmp_path / name)
         if wrong:
-            with pytest.raises(ValueError, match="data of client 3: .*in 2 of 7 rows, by up to 6: .*clipped"):
+            with pytest.raises(ValueError, match=r"data of client 3: .*in 2 of 7 rows, by up to 6: .*clipped"):
                 client_datasets(None, dataset=path, clients=[3], env_spaces=space)
         else:
             assert len(client_datasets(None, dataset=path, clients=[3], env_spaces=space)[0]) == 7

@@ -215,7 +215,11 @@ def test_ranges_hold_for_what_load_changes(point_envs, tmp_path):
         ({"use_sde": True}, ValueError, "use_sde is not supported: exploration noise"),
         ({"target_kl": 0.1}, ValueError, "target_kl is not supported.*n_epochs"),
         ({"n_steps": 64}, ValueError, "n_steps is not supported.*rollout_size"),
-        ({"policy_kwargs": {"features_extractor_class": th.nn.Flatten}}, ValueError, "features_extractor_class is not.*wrapper"),
+        (
+            {"policy_kwargs": {"features_extractor_class": th.nn.Flatten}},
+            ValueError,
+            "features_extractor_class is not.*wrapper",
+        ),
         ({"policy_kwargs": {"squash_output": True}}, ValueError, "squash_output is not supported"),
         ({"policy_kwargs": {"net_arc": [8]}}, TypeError, "did you mean 'net_arch'"),
         ({"learning_rat": 1e-3}, TypeError, r"FedAvg\(\) has no argument 'learning_rat'; did you mean 'learning_rate'"),

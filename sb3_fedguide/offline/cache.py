@@ -38,7 +38,9 @@ def cache_folder(path: str | Path | None = None) -> Path:
     try:
         return given.expanduser().absolute()
     except RuntimeError as error:
-        raise ValueError(f"the cache folder {given}: {error}; give another one with --cache-dir or ${CACHE_VARIABLE}") from None
+        raise ValueError(
+            f"the cache folder {given}: {error}; give another one with --cache-dir or ${CACHE_VARIABLE}"
+        ) from None
 
 
 def content_key(**parts: Any) -> str:
