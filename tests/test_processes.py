@@ -102,7 +102,7 @@ def test_scripts_that_start_workers(guarded, tmp_path):
         timeout=120,
     )  # fmt: skip
     assert (done.returncode == 0) == guarded, done.stderr
-    assert guarded or "its own work has to stand below" in done.stderr.splitlines()[-1]
+    assert guarded or "own work has to stand below" in done.stderr.splitlines()[-1]
 
 
 class Answering(http.server.BaseHTTPRequestHandler):

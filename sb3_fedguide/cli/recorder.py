@@ -40,14 +40,10 @@ class CostCallback(RoundCallback):
         self._earlier_seconds, self._began = earlier, time.perf_counter()
 
     @property
-    def bytes_up(self) -> int:
-        """Uploaded by all clients together."""
-        return 0 if self._exchange is None else self._exchange.bytes_up
-
-    @property
-    def bytes_down(self) -> int:
-        """Sent to all clients together."""
-        return 0 if self._exchange is None else self._exchange.bytes_down
+    def n_bytes(self) -> dict[str, int]:
+        """What all clients together sent and received, and what of it was before the first round."""
+        names = ("bytes_up", "bytes_down", "offline_bytes_up", "offline_bytes_down")
+        return {name: 0 if self._exchange is None else getattr(self._exchange.server, name) for name in names}
 
     def _on_training_start(self) -> None:
         self._exchange = next((hook for hook in self.locals["rounds"] if isinstance(hook, ExchangeCallback)), None)

@@ -34,8 +34,7 @@ def summarize(
         "rounds_done": model.round,
         "finished": model.round >= identity["n_rounds"],
         "timesteps": model.num_timesteps,
-        "bytes_up": costs.bytes_up,
-        "bytes_down": costs.bytes_down,
+        **costs.n_bytes,
         "seconds": {
             "total": total_seconds,
             "pretraining": pretraining_seconds,
@@ -84,7 +83,11 @@ def print_summary(summary: dict[str, Any], folder: str) -> None:
         f"{part} {seconds[part]:.0f} s" for part in ("pretraining", "rollout", "train", "exchange", "evaluation")
     )
     console.print(f"time   {seconds['total']:.0f} s ({parts})", highlight=False)
-    console.print(f"bytes  {format_size(summary['bytes_up'])} up, {format_size(summary['bytes_down'])} down", highlight=False)
+    offline = [summary[f"offline_bytes_{way}"] for way in ("up", "down")]
+    n_rounds = max(summary["rounds_done"], 1)
+    each = [(summary[f"bytes_{way}"] - before) / n_rounds for way, before in zip(("up", "down"), offline, strict=True)]
+    once = f"; once, before: {format_size(offline[0])} up, {format_size(offline[1])} down" if any(offline) else ""
+    console.print(f"bytes  per round {format_size(each[0])} up, {format_size(each[1])} down{once}", highlight=False)
     console.print(f"folder {folder}", highlight=False, soft_wrap=True)
 
 

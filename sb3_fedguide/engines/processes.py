@@ -74,6 +74,7 @@ class Processes(Engine):
             process.join(timeout=5)
             if process.is_alive():
                 process.kill()
+                process.join()
         self._pipes, self._processes = [], []
 
 
