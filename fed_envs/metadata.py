@@ -37,10 +37,10 @@ class Family(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     schema_version: Literal[1] = SCHEMA_VERSION
-    name: Annotated[str, Field(alias="family", pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+    name: Annotated[str, Field(alias="family", pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=100)]
     world: str
     backbone: str
-    max_episode_steps: Annotated[int, Field(strict=True, ge=1)]
+    max_episode_steps: Annotated[int, Field(strict=True, ge=1, lt=2**31)]
     description: str = ""
     clients: tuple[SerializeAsAny[Client], ...]
 
@@ -160,7 +160,10 @@ def describe(error: ValidationError) -> list[str]:
             message = "is not a known field"
         elif problem["type"] != "value_error":
             message += f" (got {problem['input']!r})"
-        lines += [f"{field}: {line}" if field and field != "clients" else line for line in message.splitlines()]
+        lines += [
+            f"{field}: {line}" if field and (field != "clients" or problem["type"] == "missing") else line
+            for line in message.splitlines()
+        ]
     return lines
 
 
@@ -173,7 +176,7 @@ def parse_family(content: Any, source: str) -> Family:
     """
     if not isinstance(content, dict):
         raise ValueError(f"{source}: a metadata file is a JSON object, this is a {type(content).__name__}")
-    if content.get("schema_version") != SCHEMA_VERSION:
+    if type(content.get("schema_version")) is not int or content["schema_version"] != SCHEMA_VERSION:
         raise ValueError(
             f"{source}: schema_version: this version of fed_envs reads {SCHEMA_VERSION}, "
             f"the file has {content.get('schema_version', 'none')}"

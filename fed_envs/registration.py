@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,9 +34,21 @@ def environment_id(family: str) -> str:
 
 
 def environment_class(world: str) -> Any:
-    """The environment class of a kind of world."""
+    """The environment class of a kind of world.
+
+    :raises ValueError: where MuJoCo cannot be loaded for the way of rendering that ``MUJOCO_GL`` asks for
+    """
     module, name = ENTRY_POINTS[world].split(":")
-    return getattr(import_module(module), name)
+    try:
+        return getattr(import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        asked = os.environ.get("MUJOCO_GL")
+        if not asked or "mujoco" in sys.modules:
+            raise
+        raise ValueError(
+            f"MuJoCo cannot be loaded with MUJOCO_GL={asked} ({type(error).__name__}: {error}): install what it needs (Debian "
+            "and Ubuntu: libosmesa6 for osmesa, libegl1 for egl), or unset MUJOCO_GL, since training renders nothing"
+        ) from error
 
 
 def register_families() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import sys
 import time
@@ -114,6 +115,7 @@ class FederatedVecEnv(VecEnv):
         self._actions: np.ndarray | None = None
         self._start_time = time.time()
         self._pool: ThreadPoolExecutor | None = None
+        self._pool_process = os.getpid()
         self._batch = self._make_batch()
         self._factories = None if self.family is not None else factories
         self._positions = Positions(self.envs)
@@ -128,6 +130,25 @@ class FederatedVecEnv(VecEnv):
             raise ValueError("the functions that made these environments are gone; make a FederatedVecEnv from them again")
         with monitors_without_files():
             return FederatedVecEnv(source, n_envs_per_client, self.client_ids, self.num_threads, role)
+
+    def reordered(self, clients: Sequence[int]) -> FederatedVecEnv:
+        """The same environments, where they stand, with the clients in the order ``clients``; it replaces this one.
+
+        :raises ValueError: for other clients
+        """
+        if sorted(clients) != sorted(self.client_ids):
+            raise ValueError(f"{list(clients)} is no order of the clients {self.client_ids}")
+        first = {client: position * self.n_envs_per_client for position, client in enumerate(self.client_ids)}
+        rows = [first[client] + copy for client in clients for copy in range(self.n_envs_per_client)]
+        other = copy.copy(self)
+        other.client_ids, other._factories = list(clients), self._factories
+        for name in ("envs", "_seeds", "_options", "reset_infos"):
+            setattr(other, name, [getattr(self, name)[row] for row in rows])
+        for name in ("_active", "_lengths", "_returns"):
+            setattr(other, name, getattr(self, name)[rows])
+        other._batch = other._make_batch()
+        other._batch.observations[:] = self._batch.observations[rows]
+        return other
 
     def _make_batch(self) -> Batch[Any]:
         if self.family is None:
@@ -240,8 +261,9 @@ class FederatedVecEnv(VecEnv):
         threads = min(self.num_threads, len(rows) // MIN_ROWS_PER_THREAD)
         if threads < 2:
             return run_rows(work, rows)
-        if self._pool is None:
+        if self._pool is None or self._pool_process != os.getpid():  # a fork has the pool, but none of its threads
             self._pool = ThreadPoolExecutor(self.num_threads - 1, thread_name_prefix="fed_envs")
+            self._pool_process = os.getpid()
         shared, work = iter(rows), watched(work)
         others = [self._pool.submit(work, shared) for _ in range(threads - 1)]
         work(shared)
@@ -322,9 +344,9 @@ class FederatedVecEnv(VecEnv):
         return rows, self._batch.observations[rows], sorted(clients)
 
     def close(self) -> None:
-        if self._pool is not None:
+        if self._pool is not None and self._pool_process == os.getpid():
             self._pool.shutdown()
-            self._pool = None
+        self._pool = None
         for env in self.envs:
             env.close()
 

@@ -15,6 +15,7 @@ import fed_envs
 from sb3_fedguide.benchmark.aggregate import aggregate, bootstrap_interval, interquartile_mean, normalise, random_actions
 from sb3_fedguide.benchmark.results import measure, read_result, read_results, volatility
 from sb3_fedguide.cli.benchmark import main
+from sb3_fedguide.cli.benchmark_tables import rows_of
 from tests.test_benchmark_command import write_result
 
 ROOT = Path(__file__).parents[1]
@@ -38,6 +39,21 @@ def test_the_measures_are_those_of_their_definitions(tmp_path):
     assert row.broadcast is None and row.paper_F is None
     (one,) = read_results(tmp_path, "Bandit2D", "tuned", ["local"], seeds=[1])["local"]
     assert volatility(one) == 0.5 and one.final == 7.0
+
+
+def test_bytes_of_the_offline_stage_are_no_bytes_of_rounds(tmp_path):
+    """Neither in the files of earlier versions, which have one sum: FedGuide's is then said to be unknown."""
+    new = write_result(tmp_path / "new", algo="fedguide", bytes_up=145_006, offline_bytes_up=145_000, offline_bytes_down=0)
+    row = measure([read_result(new)])
+    assert row.bytes_up_per_round == 6 / read_result(new).n_rounds and row.offline_bytes_up == 145_000
+    assert rows_of([row])[0]["up, down offline"] == "145.0 kB, 0 B"
+    old = [write_result(tmp_path / algo, algo=algo, env=env) for algo, env in
+           (("fedguide", "HopperHard"), ("fedguide", "Bandit2D"), ("fedavg", "HopperHard"))]  # fmt: skip
+    unknown, gaussian, averaged = (measure([read_result(path)]) for path in old)
+    assert unknown.bytes_up_per_round is None and gaussian.bytes_up_per_round == averaged.bytes_up_per_round > 0
+    shown = rows_of([unknown, averaged])
+    assert [row["up, down per round"].startswith("-") for row in shown] == [True, False]
+    assert "up, down offline" not in shown[0]
 
 
 def test_volatility_is_not_defined_for_one_round_or_a_mean_of_zero(tmp_path):

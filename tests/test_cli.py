@@ -70,7 +70,7 @@ WRONG = {
     "--env Bandit2D -params n_epochs:four": "n_epochs must be an integer",
     "--env Bandit2D -params batch_size:201": "between 2 and rollout_size=200",
     "--env Bandit2D -params gamma:2": "gamma=2 must be between 0 and 1",
-    "--env Bandit2D -params lambda_trust:-1": "must not be negative",
+    "--env Bandit2D -params lambda_trust:-1": "lambda_trust=-1 must be at least 0",
     "--env Bandit2D -params pretraining.dice_f:kl2": "'soft_chi', 'kl' or 'chi2'",
     "--env Bandit2D --metadata nowhere.json": "there is no file nowhere.json",
     "--env Bandit2D --dataset nowhere/here-v0": "no Minari dataset 'nowhere/here-v0'",

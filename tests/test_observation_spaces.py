@@ -11,7 +11,8 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
-from fed_envs import FederatedVecEnv, vec_env
+from fed_envs import FederatedVecEnv
+from fed_envs import factories as env_factories
 from sb3_fedguide import FedAvg, FedRL, Local
 from sb3_fedguide.common.evaluation import evaluate_federation
 from sb3_fedguide.common.parameters import read_policies
@@ -134,7 +135,7 @@ def test_where_sb3_has_no_policy_the_client_says_what_it_takes(kind, small, capl
 
 
 def test_that_they_are_flattened_is_said_once(caplog):
-    vec_env._say_flattened.cache_clear()
+    env_factories._say_flattened.cache_clear()
     with caplog.at_level(logging.WARNING, logger="fed_envs"):
         FederatedVecEnv(factories(PLAIN["matrix"], 3), n_envs_per_client=2).copies(2, role=1)
     (record,) = caplog.records
@@ -156,9 +157,9 @@ def test_observations_without_a_size_are_refused():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("MultiInputPolicy", "'MlpPolicy'; observations that are a Dict are flattened for it"),
-        ("CnnPolicy", "'MlpPolicy'; images are flattened for it"),
-        ("MlpLstmPolicy", "'MlpPolicy'; there is no other"),
+        ("MultiInputPolicy", "must be 'MlpPolicy' .* observations that are a Dict are flattened for it"),
+        ("CnnPolicy", "must be 'MlpPolicy' .* images are flattened for it"),
+        ("MlpLstmPolicy", "must be 'MlpPolicy' .* other networks are policy_kwargs"),
     ],
 )
 def test_names_of_other_policies_get_an_answer(cls, name, message):

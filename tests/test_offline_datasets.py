@@ -54,6 +54,60 @@ def test_offline_data_refuses_what_does_not_fit() -> None:
         OfflineData(**{**good, "actions": np.ones(7)})
 
 
+def test_what_is_not_finite_is_counted() -> None:
+    good = tiny_data().arrays()
+    for name in ("observations", "next_observations", "actions", "rewards"):
+        broken = good[name].copy()
+        broken[[2, 5]] = np.inf
+        with pytest.raises(ValueError, match=f"{name} has non-finite entries in 2 of 7 rows, first in row 2"):
+            OfflineData(**{**good, name: broken})
+
+
+def test_episodes_that_begin_where_others_ended_are_told_apart(tmp_path: Path) -> None:
+    """As in worlds with one observation, such as Bandit2D, and in those with one start that episodes are cut at."""
+    zeros, cut = np.zeros((6, 2)), np.array([1, 0, 1, 1, 0, 1], dtype=bool)
+    data = OfflineData(zeros, np.zeros((6, 1)), np.arange(6.0), zeros, np.zeros(6, bool), cut)
+    np.testing.assert_array_equal(data.episode_ends, cut)
+    np.testing.assert_array_equal(data.episode_returns(), [0, 3, 3, 9])
+    space = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Box(-1, 1, (1,))
+    write_minari(tmp_path, "cut-v0", data, *space, {})
+    again = read_minari(tmp_path / "data")
+    assert_same(again, data)
+    assert (
+        again.content_hash
+        == data.content_hash
+        != OfflineData(zeros, np.zeros((6, 1)), np.arange(6.0), zeros, cut).content_hash
+    )
+    one = tiny_data()  # here the observations say it already: one content, with or without
+    assert OfflineData(**one.arrays(), truncations=one.episode_ends).content_hash == one.content_hash
+
+
+def test_actions_outside_their_space_are_refused(tmp_path: Path) -> None:
+    data = tiny_data()
+    space = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Box(-1, 1, (1,))
+    for name, action, wrong in (("far-v0", 7.0, True), ("near-v0", 1.0 + 1e-6, False)):
+        actions = data.actions.copy()
+        actions[[1, 4]] = action
+        write_minari(tmp_path / name, name, OfflineData(**{**data.arrays(), "actions": actions}), *space, {})
+        path = str(tmp_path / name)
+        if wrong:
+            with pytest.raises(ValueError, match=r"data of client 3: .*in 2 of 7 rows, by up to 6: .*clipped"):
+                client_datasets(None, dataset=path, clients=[3], env_spaces=space)
+        else:
+            assert len(client_datasets(None, dataset=path, clients=[3], env_spaces=space)[0]) == 7
+
+
+@pytest.mark.parametrize("how", ["argument", "variable"])
+def test_a_relative_cache_keeps_what_is_made(how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FEDGUIDE_CACHE", "mine")
+    client_datasets("Bandit2D", size=20, clients=[0], cache_dir="mine" if how == "argument" else None)
+    folder = dataset_folder(fed_envs.load_family("Bandit2D"), 0, 20)
+    assert folder.is_relative_to(tmp_path / "mine") and (folder / "rows.npz").is_file()
+    with pytest.raises(ValueError, match="--cache-dir"):
+        dataset_folder(fed_envs.load_family("Bandit2D"), 0, 20, cache_dir="~nobody-of-this-name/cache")
+
+
 @pytest.mark.parametrize("family", ["HopperHard", "Reacher"])
 def test_a_rollout_is_that_of_the_clients_own_environment(family: str) -> None:
     """Every stored transition is repeated in the client's single environment, from a reset with the copy's own seed."""

@@ -174,7 +174,7 @@ def test_a_run_survives_kills_by_the_clock(algo, driver, tmp_path):
     assert survive(driver, algo, "Reacher", tmp_path, [["seconds", float(rng.uniform(0.2, 3))] for _ in range(8)], 10) >= 3
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_ends_the_run_after_the_round_with_a_checkpoint(driver, tmp_path, number, code):
     whole, log = tmp_path / "whole", tmp_path / "log.txt"
     assert driver(arguments("fedavg", "Bandit2D", whole), log) == 0

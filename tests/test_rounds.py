@@ -37,6 +37,20 @@ def test_who_misses_what_others_receive_catches_up_once():
     assert rounds.figures["federated/bytes_total"] == 4 * 16 + 2 * 12 and rounds.figures["federated/bytes_down"] == 24
 
 
+def test_what_comes_before_the_first_round_is_counted_apart():
+    rounds = Rounds(Averaging())
+    rounds.count(1000, 3000, offline=True)
+    rounds.exchange(0, {0: upload(1), 1: upload(3)})
+    before = 1000 + 2 * 16
+    assert rounds.offline_bytes_up == rounds.bytes_up == before
+    rounds.exchange(1, {0: upload(1), 1: upload(3)})
+    assert (rounds.bytes_up - rounds.offline_bytes_up, rounds.bytes_down - rounds.offline_bytes_down) == (2 * 16, 2 * 12)
+    assert rounds.figures["federated/bytes_offline"] == before + rounds.offline_bytes_down
+    again, earlier = Rounds(None), Rounds(None)
+    again.bytes_counted, earlier.bytes_counted = rounds.bytes_counted, rounds.bytes_counted[:2]
+    assert again.bytes_counted == rounds.bytes_counted and earlier.bytes_counted == [*rounds.bytes_counted[:2], 0, 0]
+
+
 def test_who_is_rejected_is_outdated():
     rounds = Rounds(Averaging())
     assert sorted(rounds.exchange(1, {0: upload(1), 1: upload(np.nan), 2: "nothing"})) == [0]
@@ -82,9 +96,9 @@ def test_one_definition_for_models_and_servers():
         ("fedavg", {"average": "everything"}, "average='everything' must be one of"),
         ("fedrl", {"average_every": 0}, "average_every=0"),
         ("fedguide-a", {"average_every": 0}, "average_every=0"),
-        ("fedguide", {"eta": -1.0}, "eta=-1.0"),
-        ("fedavg", {"client_fraction": 0.0}, "client_fraction=0.0"),
-        ("fedavg", {"upload_bound": -1.0}, "upload_bound=-1.0"),
+        ("fedguide", {"eta": -1.0}, "eta=-1 must"),
+        ("fedavg", {"client_fraction": 0.0}, "client_fraction=0 must"),
+        ("fedavg", {"upload_bound": -1.0}, "upload_bound=-1 must"),
         ("fedbest", {}, "unknown algorithm 'fedbest'"),
     ],
 )

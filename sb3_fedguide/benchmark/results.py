@@ -33,8 +33,9 @@ class Result:
     :param broadcast: client-average return of the policy that the server sent last; ``None`` where it sends none
     :param curve: evaluated round to client-average return of the deployed policies
     :param spent: evaluated round to the environment steps until then, in rounds without tests
-    :param bytes_up: uploaded per round by all clients together
-    :param bytes_down: sent per round to all clients together
+    :param bytes_up: uploaded per round by all clients together; ``None`` where an older file does not tell it from what was
+        sent before the first round. ``bytes_down`` likewise, sent to all clients together
+    :param offline_bytes_up: once, before the first round; ``offline_bytes_down`` likewise
     :param median_seconds: of the median round
     :param config: hyperparameters; ``None`` where the file does not say
     """
@@ -53,8 +54,10 @@ class Result:
     broadcast: float | None
     curve: Mapping[int, float]
     spent: Mapping[int, float]
-    bytes_up: float
-    bytes_down: float
+    bytes_up: float | None
+    bytes_down: float | None
+    offline_bytes_up: float | None
+    offline_bytes_down: float | None
     median_seconds: float
     config: Mapping[str, Any] | None
 
@@ -84,8 +87,10 @@ class Measures:
     success: float | None
     broadcast: float | None
     curve: Mapping[int, float]
-    bytes_up_per_round: float
-    bytes_down_per_round: float
+    bytes_up_per_round: float | None
+    bytes_down_per_round: float | None
+    offline_bytes_up: float | None
+    offline_bytes_down: float | None
     seconds_per_round: float
     paper_F: float | None
     speed_up: float | None = None
@@ -123,6 +128,11 @@ def _result(path: Path, content: dict[str, Any]) -> Result:
     broadcast, rounds = content.get("broadcast"), int(content["rounds_done"])
     config = content.get("config")
     final = _final_returns(content)
+    offline = _offline_bytes(content)
+    each = [
+        None if before is None else (float(content[name]) - before) / rounds
+        for name, before in zip(("bytes_up", "bytes_down"), offline, strict=True)
+    ]
     return Result(
         path=path,
         method=str(content["algo"]),
@@ -138,8 +148,10 @@ def _result(path: Path, content: dict[str, Any]) -> Result:
         broadcast=None if broadcast is None else float(broadcast["average"]),
         curve={int(round): float(value) for round, value in deployed["curve"]},
         spent=_spent(content),
-        bytes_up=float(content["bytes_up"]) / rounds,
-        bytes_down=float(content["bytes_down"]) / rounds,
+        bytes_up=each[0],
+        bytes_down=each[1],
+        offline_bytes_up=offline[0],
+        offline_bytes_down=offline[1],
         median_seconds=float(content["seconds"]["median_round"]),
         config=None if config is None else dict(config),
     )
@@ -160,6 +172,19 @@ def _spent(content: Mapping[str, Any]) -> dict[int, float]:
         return {int(round): float(round) for round, _ in deployed["curve"]}
     per_round = (content["timesteps"] - tests) / content["rounds_done"]
     return {int(round): steps / per_round for round, steps, _ in deployed["client_curve"]}
+
+
+def _offline_bytes(content: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """What went up and down before the first round; ``None`` where a file does not say and it was not nothing.
+
+    Files of earlier versions have one sum. Of the methods that they can be of, those with a prior trained its trunk together,
+    except for the Gaussian prior of Bandit2D, which has none.
+    """
+    if "offline_bytes_up" in content:
+        return float(content["offline_bytes_up"]), float(content["offline_bytes_down"])
+    prior = ((content.get("config") or {}).get("pretraining") or {}).get("prior", "auto")
+    gaussian = prior == "gaussian" or (prior == "auto" and content["env"] == "Bandit2D")
+    return (0.0, 0.0) if gaussian or not str(content["algo"]).startswith("fedguide") else (None, None)
 
 
 def read_results(
@@ -219,8 +244,10 @@ def measure(results: Sequence[Result], at_rounds: Sequence[int] = (), target: fl
             for round in at_rounds
             if all(round in curve for curve in curves)
         },
-        bytes_up_per_round=float(np.mean([result.bytes_up for result in results])),
-        bytes_down_per_round=float(np.mean([result.bytes_down for result in results])),
+        bytes_up_per_round=_known_mean([result.bytes_up for result in results]),
+        bytes_down_per_round=_known_mean([result.bytes_down for result in results]),
+        offline_bytes_up=_known_mean([result.offline_bytes_up for result in results]),
+        offline_bytes_down=_known_mean([result.offline_bytes_down for result in results]),
         seconds_per_round=min(result.median_seconds for result in results),
         paper_F=PAPER_F.get(results[0].family, {}).get(results[0].method),
         speed_up=None if target is None else speed_up(results, target),
@@ -237,6 +264,11 @@ def speed_up(results: Sequence[Result], target: float) -> float | None:
         if np.mean([result.curve[round] for result in results]) >= target:
             return results[0].n_rounds / float(np.mean([result.spent[round] for result in results]))
     return None
+
+
+def _known_mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def volatility(result: Result) -> float | None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.benchmark_arguments import PASSED_ON, SETTINGS, check_methods, parse_benchmark, train_flags
+from sb3_fedguide.cli.output import pipe_may_close
 from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, one_message
 from sb3_fedguide.cli.train import (
     EXIT_INTERRUPTED,
@@ -49,6 +50,7 @@ class Plan:
     n_done: int
 
 
+@pipe_may_close
 def main(argv: Sequence[str] | None = None, prog: str = "fedguide benchmark") -> int:
     """Run the command.
 

@@ -49,7 +49,8 @@ def rows_of(measures: Sequence[Measures]) -> list[Row]:
         **{f"round {round}": partial(_at_round, round) for round in rounds},
         "broadcast": lambda row: _number(row.broadcast, ".4g"),
         "success": lambda row: _number(row.success, ".2f"),
-        "up, down per round": lambda row: f"{format_size(row.bytes_up_per_round)}, {format_size(row.bytes_down_per_round)}",
+        "up, down per round": lambda row: _sizes(row.bytes_up_per_round, row.bytes_down_per_round),
+        "up, down offline": lambda row: _sizes(row.offline_bytes_up, row.offline_bytes_down) if row.offline_bytes_up else None,
         "s per round": lambda row: f"{row.seconds_per_round:.3g}",
         "paper F": lambda row: _number(row.paper_F, "g"),
     }
@@ -81,6 +82,10 @@ def _at_round(round: int, row: Measures) -> str | None:
 
 def _score(family: str, row: Aggregate) -> str:
     return f"{row.scores[family]:.3f}"
+
+
+def _sizes(up: float | None, down: float | None) -> str | None:
+    return None if up is None or down is None else f"{format_size(up)}, {format_size(down)}"
 
 
 def _number(value: float | None, form: str) -> str | None:

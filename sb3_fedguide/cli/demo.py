@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_fedguide.cli.arguments import OneLineParser
+from sb3_fedguide.cli.output import pipe_may_close
 
 if TYPE_CHECKING:
     from fed_envs import Family
@@ -20,6 +21,7 @@ METHODS = {"Local": "local", "FedAvg": "fedavg", "FedGuide": "fedguide"}
 DRAWN = ("FedAvg", "FedGuide")
 
 
+@pipe_may_close
 def main(argv: Sequence[str] | None = None) -> int:
     """Train both, print the measures, write the picture and the numbers."""
     parser = OneLineParser(prog="fedguide demo", description=__doc__)

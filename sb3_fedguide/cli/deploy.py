@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import socket
 import ssl
 import sys
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_fedguide.cli.arguments import OneLineParser
+from sb3_fedguide.cli.output import pipe_may_close
 from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.cli.run_folder import exclusive, write_json
 from sb3_fedguide.cli.signals import StopSignals
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 CONFIG = "config.json"
 
 
+@pipe_may_close
 def main(argv: Sequence[str]) -> int:
     """Run the command.
 
@@ -40,6 +41,8 @@ def main(argv: Sequence[str]) -> int:
     except ValueError as error:
         print(f"fedguide deploy: error: {error}", file=sys.stderr)
         return EXIT_USAGE
+    except BrokenPipeError:
+        raise
     except OSError as error:
         where = "" if error.filename is None else f"{error.filename}: "
         print(f"fedguide deploy: error: {where}{error.strerror or error}", file=sys.stderr)
@@ -138,22 +141,24 @@ def _check_server(deployment: ClientDeployment) -> None:
     :raises ValueError: where ``ca`` holds no certificate
     :raises ConnectionError: where somebody else answers
     """
-    host, _ = deployment.address
+    import httpx
+
     try:
         context = ssl.create_default_context(cafile=deployment.ca)
     except ssl.SSLError:
         raise ValueError(f"{deployment.ca} holds no certificate; it has to be the ca.crt of the server's machine") from None
     try:
-        with (
-            socket.create_connection(deployment.address, timeout=10.0) as connection,
-            context.wrap_socket(connection, server_hostname=host),
-        ):
-            pass
-    except ssl.SSLCertVerificationError as error:
-        why = error.verify_message
-        raise ConnectionError(f"{deployment.server} is not the server that {deployment.ca} vouches for: {why}") from None
-    except OSError:
-        print(f"{deployment.server} does not answer yet; waiting for it", flush=True)
+        # By the way that Flower takes, a proxy included.
+        with httpx.Client(verify=context, timeout=10.0) as client:
+            client.get(f"https://{deployment.server}/")
+    except httpx.HTTPError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, ssl.SSLCertVerificationError):
+            cause = cause.__cause__ or cause.__context__
+        if cause is not None:
+            why = cause.verify_message
+            raise ConnectionError(f"{deployment.server} is not the server that {deployment.ca} vouches for: {why}") from None
+        print(f"{deployment.server} does not answer yet ({error}); waiting for it", flush=True)
 
 
 def _try_site(deployment: ClientDeployment) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.cli.arguments import OneLineParser
+from sb3_fedguide.cli.output import pipe_may_close
 from sb3_fedguide.cli.saved_run import load_model, read_run
 from sb3_fedguide.cli.train import import_packages
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 MAX_FRAMES = 200
 
 
+@pipe_may_close
 def main(argv: Sequence[str] | None = None, prog: str = "fedguide evaluate") -> int:
     """Run the command.
 

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from sb3_fedguide.cli.names import nearest
+from sb3_fedguide.cli.output import pipe_may_close
 
 USAGE = """usage: fedguide COMMAND ...
 
@@ -20,6 +21,7 @@ USAGE = """usage: fedguide COMMAND ...
 fedguide COMMAND --help shows a command's flags"""
 
 
+@pipe_may_close
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a subcommand and return its exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)

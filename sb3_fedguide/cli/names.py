@@ -8,8 +8,8 @@ from collections.abc import Iterable
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """``" Did you mean 'x'?"``, or nothing if nothing is near."""
-    by_lower = {candidate.lower(): candidate for candidate in known}
-    match = difflib.get_close_matches(str(name).lower(), by_lower, n=1, cutoff=0.5)
+    by_lower = {candidate.lower().lstrip("-"): candidate for candidate in known}
+    match = difflib.get_close_matches(str(name).lower().lstrip("-"), by_lower, n=1, cutoff=0.6)
     return f" Did you mean {by_lower[match[0]]!r}?" if match else ""
 
 

@@ -18,12 +18,14 @@ TIMES = ("rollout", "train", "exchange")
 class CostCallback(RoundCallback):
     """Adds up seconds by part of a round and the bytes that the exchange carried."""
 
-    state_attributes = ("seconds", "round_seconds", "pretraining_seconds", "total_seconds")
+    state_attributes = ("seconds", "round_seconds", "pretraining_seconds", "total_seconds", "rejected")
 
     def __init__(self) -> None:
         super().__init__()
         self.seconds = dict.fromkeys(TIMES, 0.0)
         self.round_seconds: list[float] = []
+        #: rounds in which the server rejected a client's upload, by client
+        self.rejected: dict[int, int] = {}
         #: of the offline stage, which the caller measures
         self.pretraining_seconds = 0.0
         self._earlier_seconds, self._began = 0.0, time.perf_counter()
@@ -39,14 +41,10 @@ class CostCallback(RoundCallback):
         self._earlier_seconds, self._began = earlier, time.perf_counter()
 
     @property
-    def bytes_up(self) -> int:
-        """Uploaded by all clients together."""
-        return 0 if self._exchange is None else self._exchange.bytes_up
-
-    @property
-    def bytes_down(self) -> int:
-        """Sent to all clients together."""
-        return 0 if self._exchange is None else self._exchange.bytes_down
+    def n_bytes(self) -> dict[str, int]:
+        """What all clients together sent and received, and what of it was before the first round."""
+        names = ("bytes_up", "bytes_down", "offline_bytes_up", "offline_bytes_down")
+        return {name: 0 if self._exchange is None else getattr(self._exchange.server, name) for name in names}
 
     def _on_training_start(self) -> None:
         self._exchange = next((hook for hook in self.locals["rounds"] if isinstance(hook, ExchangeCallback)), None)
@@ -55,6 +53,9 @@ class CostCallback(RoundCallback):
     def _on_round_end(self) -> None:
         for name in TIMES:
             self.seconds[name] += float(self.logger.name_to_value.get(f"time/{name}", 0.0))
+        for client in self.model.client_ids:
+            if f"client_{client}/rejected" in self.logger.name_to_value:
+                self.rejected[client] = self.rejected.get(client, 0) + 1
         now = time.perf_counter()
         self.round_seconds.append(now - self._started)
         self._started = now

@@ -26,6 +26,8 @@ def summarize(
     :param identity: what else identifies the run, such as its algorithm
     """
     evaluated = evaluation.last if evaluation is not None else {}
+    evaluating = evaluation.seconds if evaluation is not None else 0.0
+    other = max(0.0, total_seconds - pretraining_seconds - sum(costs.seconds.values()) - evaluating)
     result: dict[str, Any] = {
         **identity,
         "seed": model.seed,
@@ -35,13 +37,14 @@ def summarize(
         "finished": model.round >= identity["n_rounds"],
         "timesteps": model.environment_steps,
         "test_timesteps": model.test_steps,
-        "bytes_up": costs.bytes_up,
-        "bytes_down": costs.bytes_down,
+        **costs.n_bytes,
+        "rejected_uploads": {str(client): number for client, number in sorted(costs.rejected.items())},
         "seconds": {
             "total": total_seconds,
             "pretraining": pretraining_seconds,
             **costs.seconds,
-            "evaluation": evaluation.seconds if evaluation is not None else 0.0,
+            "evaluation": evaluating,
+            "other": other,  # pictures, checkpoints, logs
             "median_round": statistics.median(costs.round_seconds) if costs.round_seconds else None,
         },
     }
@@ -83,10 +86,17 @@ def print_summary(summary: dict[str, Any], folder: str) -> None:
         console.print(f"{table.title}; no evaluation")
     seconds = summary["seconds"]
     parts = ", ".join(
-        f"{part} {seconds[part]:.0f} s" for part in ("pretraining", "rollout", "train", "exchange", "evaluation")
+        f"{part} {seconds[part]:.0f} s" for part in ("pretraining", "rollout", "train", "exchange", "evaluation", "other")
     )
     console.print(f"time   {seconds['total']:.0f} s ({parts})", highlight=False)
-    console.print(f"bytes  {format_size(summary['bytes_up'])} up, {format_size(summary['bytes_down'])} down", highlight=False)
+    offline = [summary[f"offline_bytes_{way}"] for way in ("up", "down")]
+    n_rounds = max(summary["rounds_done"], 1)
+    each = [(summary[f"bytes_{way}"] - before) / n_rounds for way, before in zip(("up", "down"), offline, strict=True)]
+    once = f"; once, before: {format_size(offline[0])} up, {format_size(offline[1])} down" if any(offline) else ""
+    console.print(f"bytes  per round {format_size(each[0])} up, {format_size(each[1])} down{once}", highlight=False)
+    if summary["rejected_uploads"]:
+        counts = ", ".join(f"client {client} {number}" for client, number in summary["rejected_uploads"].items())
+        console.print(f"rejected uploads: {counts}", highlight=False)
     console.print(f"folder {folder}", highlight=False, soft_wrap=True)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import math
 import operator
 import re
 import types
@@ -17,6 +16,7 @@ import pydantic
 
 from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.names import check_names
+from sb3_fedguide.settings.ranges import check_range
 
 #: Constructor parameters that have a flag of their own or no meaning on the command line.
 NOT_HYPERPARAMETERS = {
@@ -27,56 +27,6 @@ NOT_HYPERPARAMETERS = {
 #: A value that falls linearly to zero over the run, as in rl-baselines3-zoo; or one until a share of the run is over, then
 #: zero.
 SCHEDULE = re.compile(r"^(?P<kind>lin|until)_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)?)$")
-
-_OPEN = 1e-12  # smallest value of what must be positive
-
-#: Any integer stays below this.
-MAX_INTEGER = 2**31
-
-#: Closed ranges of what no constructor checks. Sizes end far above what is useful and below what no memory holds.
-RANGES: dict[str, tuple[float, float]] = {
-    "n_rounds": (1, 1e7),
-    "learning_rate": (_OPEN, math.inf),
-    "n_epochs": (1, math.inf),
-    "gamma": (0, 1),
-    "gae_lambda": (0, 1),
-    "clip_range": (_OPEN, math.inf),
-    "clip_range_vf": (_OPEN, math.inf),
-    "ent_coef": (0, math.inf),
-    "vf_coef": (0, math.inf),
-    "max_grad_norm": (_OPEN, math.inf),
-    "n_envs_per_client": (1, 1000),
-    "rollout_size": (2, 1e7),
-    "stats_window_size": (1, math.inf),
-    "bc_weight": (0, 1),
-    "client_fraction": (_OPEN, 1),
-    "upload_bound": (_OPEN, math.inf),
-    "trim_fraction": (0, 0.5),
-    "beta": (0, 1),
-    "n_experts": (1, 1e4),
-    "eta": (_OPEN, math.inf),
-    "prior_states": (1, 1e7),
-    "density_steps": (1, math.inf),
-    "sampling_steps": (1, math.inf),
-    "adapt_temperature": (_OPEN, math.inf),
-    "adapt_weight": (0, 1),
-    "average_until": (1, math.inf),
-    "server_step": (_OPEN, math.inf),
-    "server_momentum": (0, 1),
-    "mix": (0, 100),
-    "screening": (0, 0.5),
-    "buffer_size": (1, 1e8),
-    "learning_starts": (0, math.inf),
-    "tau": (_OPEN, 1),
-    "train_freq": (1, math.inf),
-    "noise_theta": (0, math.inf),
-    "noise_sigma": (0, math.inf),
-    "noise_dt": (_OPEN, math.inf),
-    "mu": (0, math.inf),
-    "lambda_global": (0, math.inf),
-    "lambda_local": (0, math.inf),
-    "reference_every": (1, math.inf),
-}
 
 ACTIVATIONS = {"tanh": "Tanh", "relu": "ReLU", "elu": "ELU", "leaky_relu": "LeakyReLU", "silu": "SiLU"}
 
@@ -196,7 +146,7 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
             expected = " or ".join([_describe(option) for option in options] + ["a schedule such as lin_3e-4"] * schedule)
             raise ValueError(f"{name} must be {expected}, but it is {_show(value)}") from None
     if isinstance(number, float | int) and not isinstance(number, bool):
-        _check_range(name, number)
+        check_range(name, number)
     return value
 
 
@@ -247,21 +197,6 @@ class Until:
 
     def __call__(self, progress_remaining: float) -> float:
         return 1.0 if progress_remaining > 1 - self.share + 1e-9 else 0.0
-
-
-def _check_range(name: str, number: float) -> None:
-    if isinstance(number, int) and abs(number) >= MAX_INTEGER:
-        raise ValueError(f"{name} must be below 2^31, but it has {len(str(abs(number)))} digits")
-    if not math.isfinite(number):
-        raise ValueError(f"{name}={number} must be finite")
-    low, high = RANGES.get(name, (-math.inf, math.inf))
-    if not low <= number <= high:
-        lower = "positive" if low == _OPEN else f"at least {low:g}"
-        if high <= 1:
-            expected = f"between {low:g} and {high:g}"
-        else:
-            expected = lower if number < low else f"at most {high:.0f}"
-        raise ValueError(f"{name}={number:g} must be {expected}")
 
 
 def _reason(problem: Any) -> str:

@@ -5,17 +5,19 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from contextlib import suppress
 from types import FrameType, TracebackType
 from typing import Any
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopSignals:
-    """While it is entered, SIGINT and SIGTERM end the training after the running round; a second one ends it at once.
+    """While it is entered, SIGINT, SIGTERM and SIGHUP end the training after the running round; a second one ends it at once.
 
     At once means ``KeyboardInterrupt``, as does the first one while :attr:`can_wait` is false: before the first round there
-    is nothing to wait for. A signal that the process ignores stays ignored.
+    is nothing to wait for. A signal that the process ignores stays ignored. SIGHUP says that the terminal is gone, and may
+    come from the shell and from the kernel: another one means the same, and what goes to the terminal is dropped.
     """
 
     def __init__(self) -> None:
@@ -24,13 +26,15 @@ class StopSignals:
         #: whether rounds are running whose end somebody looks for :attr:`received`
         self.can_wait = False
         self._earlier: dict[int, Any] = {}
+        self._terminals: list[int] = []
 
     @property
     def exit_code(self) -> int:
-        """As shells report it: 130 for SIGINT, 143 for SIGTERM."""
+        """As shells report it: 130 for SIGINT, 143 for SIGTERM, 129 for SIGHUP."""
         return 128 + (self.received or signal.SIGINT)
 
     def __enter__(self) -> StopSignals:
+        self._terminals = [descriptor for descriptor in (1, 2) if _is_terminal(descriptor)]
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
                 if signal.getsignal(number) is not signal.SIG_IGN:
@@ -42,9 +46,27 @@ class StopSignals:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        again = self.received is not None
+        again = self.received is not None and number != signal.SIGHUP
+        if number == signal.SIGHUP:
+            _drop_output(self._terminals)
         self.received = self.received or number
         if again or not self.can_wait:
             raise KeyboardInterrupt
-        # A handler may interrupt a print, so it does not print itself.
-        os.write(2, b"\nstopping after this round; once more to stop at once\n")
+        with suppress(OSError):
+            # A handler may interrupt a print, so it does not print itself.
+            os.write(2, b"\nstopping after this round; once more to stop at once\n")
+
+
+def _is_terminal(descriptor: int) -> bool:
+    try:
+        return os.isatty(descriptor)
+    except OSError:
+        return False
+
+
+def _drop_output(descriptors: list[int]) -> None:
+    """Point them nowhere: to write to a terminal that is gone is an error, in the middle of whatever prints."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in descriptors:
+        os.dup2(null, descriptor)
+    os.close(null)

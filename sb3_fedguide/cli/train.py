@@ -20,6 +20,7 @@ from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.gymnasium_ids import is_registered, registered_family
 from sb3_fedguide.cli.names import check_names
+from sb3_fedguide.cli.output import pipe_may_close
 from sb3_fedguide.cli.resume import (
     check_length,
     finished_rounds,
@@ -42,11 +43,12 @@ PACKAGE = Path(__file__).parents[1]
 ID_PREFIX, ID_SUFFIX = "fed_envs/", "-v0"
 
 
+@pipe_may_close
 def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
     """Run the command.
 
     :return: the exit code: 0, 1 where a file could not be written or a client broke, 2 for wrong input, 130 after an
-        interrupt (SIGINT), 143 after SIGTERM
+        interrupt (SIGINT), 143 after SIGTERM, 129 after SIGHUP
     """
     arguments = parse_train(argv, prog)
     command = shlex.join(sys.orig_argv if argv is None else [prog, *argv])
@@ -76,6 +78,8 @@ def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
     except EngineError as error:
         print(f"{prog}: error: {error}", file=sys.stderr)
         return EXIT_FAILED
+    except BrokenPipeError:
+        raise
     except OSError as error:  # a full disk, or a folder that is read-only
         where = error.filename or arguments.log_folder
         print(f"{prog}: error: {where}: {error.strerror or error}; what was written before stays", file=sys.stderr)

@@ -83,29 +83,20 @@ class ExchangeCallback(RoundCallback):
     Over a network :func:`sb3_fedguide.server.serve.serve` takes its place; clients, strategy and :class:`Rounds` are the same.
     """
 
-    state_attributes = ("bytes_up", "bytes_down")
+    state_attributes = ("bytes_counted",)
 
     def __init__(self) -> None:
         super().__init__()
         self.server = Rounds(None)
 
     @property
-    def bytes_up(self) -> int:
-        """Uploaded by all clients together."""
-        return self.server.bytes_up
+    def bytes_counted(self) -> list[int]:
+        """See :attr:`Rounds.bytes_counted`."""
+        return self.server.bytes_counted
 
-    @bytes_up.setter
-    def bytes_up(self, value: int) -> None:
-        self.server.bytes_up = value
-
-    @property
-    def bytes_down(self) -> int:
-        """Sent to all clients together."""
-        return self.server.bytes_down
-
-    @bytes_down.setter
-    def bytes_down(self, value: int) -> None:
-        self.server.bytes_down = value
+    @bytes_counted.setter
+    def bytes_counted(self, saved: list[int]) -> None:
+        self.server.bytes_counted = saved
 
     def save_state(self) -> State:
         delays = self.model.delays
@@ -113,7 +104,9 @@ class ExchangeCallback(RoundCallback):
 
     def load_state(self, state: State) -> None:
         """:raises ValueError: for the state of a run with other delays"""
-        super().load_state({name: value for name, value in state.items() if name != "delays"})
+        if "bytes_up" in state:  # of an earlier version
+            state = {**state, "bytes_counted": [state["bytes_up"], state["bytes_down"]]}
+        super().load_state({name: state[name] for name in self.state_attributes})
         if (self.model.delays is None) != ("delays" not in state):
             ran, goes_on = ("with", "without") if self.model.delays is None else ("without", "with")
             raise ValueError(f"the run was {ran} simulated delays and cannot go on {goes_on} them; see simulate_delays()")
@@ -123,7 +116,7 @@ class ExchangeCallback(RoundCallback):
     def _on_training_start(self) -> None:
         model = self.model
         if model.round == 0:
-            self.bytes_up, self.bytes_down = model.pretraining_bytes
+            self.bytes_counted = [*model.pretraining_bytes] * 2
         self.server.strategy = model.strategy
         self.server.outdated = {client for client, outdated in zip(model.client_ids, model.outdated, strict=True) if outdated}
         if model.delays is not None and model.round == 0:

@@ -1,17 +1,124 @@
-"""What a federation can be made of."""
+"""What a federation's environments are made of, and which ones fit a model that exists already."""
 
 from __future__ import annotations
 
+import io
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from fed_envs import FederatedVecEnv
 
+if TYPE_CHECKING:
+    from fed_envs import Family
+
 FederationLike = str | Path | Any | Sequence[Callable[[], gym.Env]]
+
+
+class FederatedEnvironments(BaseAlgorithm):
+    """Mixin of a federation: its policies meet the environments of their own clients, whatever it is given.
+
+    Environments of the same clients in another order are put into the model's. A family's name, a metadata file or a list
+    of factories stands for all of its clients: those that live here are taken, with as many copies as before.
+    """
+
+    client_ids: list[int]
+    n_envs_per_client: int
+    family: Family | None
+    rollout_size: int
+
+    @abstractmethod
+    def _fit_copies(self) -> None:
+        """Make anew what is as large as the number of environments per client, after that has changed."""
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path | io.BufferedIOBase,
+        env: FederationLike | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Any:
+        """As in SB3, whose archive is unpickled: it can execute any code, so load only what you trust.
+
+        :meth:`import_parameters` reads a file of :meth:`export_parameters` from anybody.
+
+        :param env: environments of the same clients; a ``FederatedVecEnv`` may have another number of copies per client
+        :raises ValueError: for environments of other clients or of another family
+        """
+        model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        if env is not None:
+            env = model._matching(env)
+            if env.n_envs_per_client != model.n_envs_per_client:
+                check_copies(model.rollout_size, env.n_envs_per_client)
+                model.n_envs_per_client, model.n_envs = env.n_envs_per_client, env.num_envs
+                model._fit_copies()
+            model.set_env(env, force_reset)
+            env.seed(model.seed)
+        return model
+
+    def set_env(self, env: FederationLike, force_reset: bool = True) -> None:
+        """Train in other environments of the same clients; otherwise as in SB3.
+
+        :raises ValueError: for environments of other clients, of another family, or with another number of copies
+        """
+        env = self._matching(env)
+        if env.n_envs_per_client != self.n_envs_per_client:
+            raise ValueError(
+                f"set_env() keeps the number of environments per client, {self.n_envs_per_client} and not "
+                f"{env.n_envs_per_client}; {type(self).__name__}.load(path, env=...) takes another"
+            )
+        super().set_env(env, force_reset)
+        self.family = env.family
+
+    def _matching(self, env: FederationLike) -> FederatedVecEnv:
+        """``env`` with this model's clients in this model's order."""
+        if not isinstance(env, FederatedVecEnv | VecEnv | gym.Env):
+            env = as_federated_env(env, self.n_envs_per_client, self.client_ids)
+        env = as_federated_env(env)
+        assert isinstance(env, FederatedVecEnv)
+        own, theirs = _name(self.family), _name(env.family)
+        if own != theirs:
+            raise ValueError(
+                f"the environments are of {theirs}, and this {type(self).__name__} is a federation of {own}: the policies of "
+                "its clients would play others' environments. To start from what these have learned, make a new model of "
+                "those environments, and use export_parameters() and import_parameters()"
+            )
+        if set(env.client_ids) != set(self.client_ids):
+            raise ValueError(
+                f"the environments are of the clients {env.client_ids}, and this {type(self).__name__} holds the clients "
+                f"{self.client_ids}; make them with clients={self.client_ids}"
+            )
+        if (env.observation_space, env.action_space) != (self.observation_space, self.action_space):
+            raise ValueError(
+                f"the environments have the spaces {env.observation_space} and {env.action_space}, and this "
+                f"{type(self).__name__} was made for {self.observation_space} and {self.action_space}"
+            )
+        return env if env.client_ids == self.client_ids else env.reordered(self.client_ids)
+
+    @staticmethod
+    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """Accept whatever a federation can be made of wherever SB3 takes an environment."""
+        wrapped = as_federated_env(env)
+        assert wrapped is not None
+        return BaseAlgorithm._wrap_env(wrapped, verbose, monitor_wrapper)
+
+
+def check_copies(rollout_size: int, n_envs_per_client: int) -> None:
+    """:raises ValueError: where a round's steps cannot be divided among a client's environments"""
+    if rollout_size < 1 or rollout_size % n_envs_per_client:
+        raise ValueError(
+            f"n_envs_per_client={n_envs_per_client} must divide rollout_size={rollout_size}, the steps per client and round"
+        )
 
 
 def as_federated_env(
@@ -24,6 +131,14 @@ def as_federated_env(
 
     :raises ValueError: for an environment that holds a single client
     """
+    if isinstance(env, FederatedVecEnv):
+        for name, given, own in (
+            ("clients", clients, env.client_ids),
+            ("n_envs_per_client", n_envs_per_client if n_envs_per_client > 1 else None, env.n_envs_per_client),
+            ("num_threads", num_threads if num_threads > 1 else None, env.num_threads),
+        ):
+            if given is not None and given != own:
+                raise ValueError(f"{name}={given} does not fit the FederatedVecEnv, which has {own}: leave {name} out")
     if env is None or isinstance(env, FederatedVecEnv):
         return env
     if isinstance(env, VecEnv | gym.Env):
@@ -32,3 +147,8 @@ def as_federated_env(
             "a metadata file, a fed_envs.FederatedVecEnv or a list of environment factories"
         )
     return FederatedVecEnv(env, n_envs_per_client=n_envs_per_client, clients=clients, num_threads=num_threads)
+
+
+def _name(family: Family | None) -> str:
+    """What tells one family from another."""
+    return "functions of your own" if family is None else f"the family {family.name} ({family.content_hash[:12]})"

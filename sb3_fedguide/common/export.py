@@ -22,6 +22,7 @@ from fed_envs.files import atomic_file
 from sb3_fedguide.common.ddpg_policy import BoundedActor
 from sb3_fedguide.common.distributions import Gaussian, action_distribution
 from sb3_fedguide.common.normalization import FederatedNormalizer
+from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.spaces import is_plain
 
 logger = logging.getLogger(__name__)
@@ -75,6 +76,8 @@ class ClientPolicy:
     normalization: Normalization | None
     settings: dict[str, Any] = field(default_factory=dict)
     seed: int | None = None
+    #: of the policy, for further training alone
+    network: dict[str, Any] = field(default_factory=dict)
 
     def to_sb3(self) -> PPO | DDPG:
         """An ordinary model that takes what the environment returns; ``set_env`` gives it one to train in.
@@ -107,6 +110,7 @@ class ClientPolicy:
         kwargs: dict[str, Any] = {
             "net_arch": {actor: self._hidden_sizes(critic=False), critic: self._hidden_sizes(critic=True)},
             "activation_fn": self.activation_fn,
+            **self.network,
         }
         is_flat = isinstance(self.observation_space, spaces.Box) and len(self.observation_space.shape) == 1
         if self.normalization is not None or not is_flat:
@@ -266,6 +270,12 @@ FORMATS: dict[str, Callable[[ClientPolicy, Any], None]] = {
 }
 
 
+def client_settings(model: Any) -> dict[str, Any]:
+    """What a client's own model takes over of a federation's hyperparameters; it has one environment."""
+    settings = {name: getattr(model, name) for name in SETTINGS["DDPG" if isinstance(model, DDPG) else "PPO"]}
+    return {**settings, "n_steps": model.rollout_size} if "n_steps" in settings else settings
+
+
 class ClientPolicies(BaseAlgorithm):
     """Mixin of a federation that gives its clients' policies away."""
 
@@ -282,7 +292,9 @@ class ClientPolicies(BaseAlgorithm):
 
         :raises ValueError: for a client that does not live here
         """
-        return self.client_policy(client_id).to_sb3()
+        model = self.client_policy(client_id).to_sb3()
+        model._stats_window_size, model.verbose = self._stats_window_size, self.verbose
+        return model
 
     def export(self, client_id: int, path: str | Path) -> None:
         """Write client ``client_id``'s policy in the form that the suffix says; none of them needs this package.
@@ -314,9 +326,17 @@ class ClientPolicies(BaseAlgorithm):
             self.policy.activation_fn,
             self.policy.client_state_dict(index),
             Normalization.of(moments.mean[index], moments.var[index]) if self.normalizer.norm_obs else None,
-            {name: getattr(self, name) for name in SETTINGS[self.learner]},
+            client_settings(self),
             self.seed,
+            self._network_settings(),
         )
+
+    def _network_settings(self) -> dict[str, Any]:
+        names = ("optimizer_class", "optimizer_kwargs", "ortho_init", "log_std_init")
+        found = {name: getattr(self.policy, name) for name in names if hasattr(self.policy, name)}
+        if found["optimizer_class"] is ParticipationAdam:  # Adam, for clients that come and go
+            found["optimizer_class"] = th.optim.Adam
+        return found
 
     @property
     def learner(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,9 +20,11 @@ from torch import nn
 from fed_envs import FederatedVecEnv
 from fed_envs.state import State
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy, check_ddpg_actions
+from sb3_fedguide.common.ddpg_settings import check_settings
 from sb3_fedguide.common.environments import FederationLike, as_federated_env
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation
+from sb3_fedguide.common.keywords import check_policy, check_policy_keywords
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
 from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.participation import ParticipationAdam
@@ -30,6 +33,7 @@ from sb3_fedguide.common.seeding import Role, integer_seed
 from sb3_fedguide.common.training_log import RoundStatistics
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
 from sb3_fedguide.server.validation import UPLOAD_BOUND
+from sb3_fedguide.settings.ranges import check_ranges
 
 
 class FederatedDDPG(Federation, DDPG):
@@ -113,6 +117,8 @@ class FederatedDDPG(Federation, DDPG):
         device: th.device | str = "cpu",
         _init_setup_model: bool = True,
     ) -> None:
+        check_ranges(locals())
+        check_policy(policy, self.policy_aliases, type(self))
         env = as_federated_env(env, n_envs_per_client, clients, num_threads)
         self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
         if env is not None:
@@ -133,19 +139,21 @@ class FederatedDDPG(Federation, DDPG):
             train_freq=train_freq,
             gradient_steps=gradient_steps,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
+            policy_kwargs=dict(policy_kwargs or {}),  # SB3 adds to it
             verbose=verbose,
             seed=int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else seed,
             device=device,
             _init_setup_model=False,
         )
         self._stats_window_size = stats_window_size
-        _check_settings(self)
+        check_settings(self)
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
         assert self.seed is not None
+        check_ranges(vars(self))  # those of subclasses, and of load()
+        check_policy_keywords(self.policy_class, self.policy_kwargs)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         if self.replay_buffer is None:
@@ -162,8 +170,6 @@ class FederatedDDPG(Federation, DDPG):
             kwargs["optimizer_class"] = ParticipationAdam
         self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule, **kwargs).to(self.device)  # type: ignore
         self._create_aliases()
-        shape = (self.n_clients, self.n_envs_per_client, self.action_space.shape[0])  # type: ignore[index]
-        self.noise = OrnsteinUhlenbeckNoise(shape, self.noise_theta, self.noise_sigma, self.noise_dt)
         self.normalizer = FederatedNormalizer(
             self.n_clients,
             self.n_envs_per_client,
@@ -173,7 +179,35 @@ class FederatedDDPG(Federation, DDPG):
             norm_reward=bool(self.normalize),
             shared=self.normalize == "shared",
         )
+        self._fit_copies()
         self._start_server()
+
+    def _fit_copies(self) -> None:
+        assert self.replay_buffer is not None
+        check_settings(self)
+        self.n_envs = self.n_clients * self.n_envs_per_client
+        self.normalizer.reset_returns(self.n_envs_per_client)
+        self._fit_replay_buffer()
+        shape = (self.n_clients, self.n_envs_per_client, self.action_space.shape[0])  # type: ignore[index]
+        self.noise = OrnsteinUhlenbeckNoise(shape, self.noise_theta, self.noise_sigma, self.noise_dt)
+
+    def _fit_replay_buffer(self) -> None:
+        assert self.replay_buffer is not None
+        self.replay_buffer.client_ids = list(self.client_ids)
+        self.replay_buffer.n_envs_per_client, self.replay_buffer.n_envs = self.n_envs_per_client, self.n_envs
+
+    def load_replay_buffer(self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """As in SB3, whose file is unpickled: load only what you trust.
+
+        :raises ValueError: for other clients' transitions
+        """
+        own = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        clients = getattr(self.replay_buffer, "client_ids", None)
+        if clients != self.client_ids:
+            self.replay_buffer = own
+            raise ValueError(f"the replay buffer in {path} is of the clients {clients}, not of {self.client_ids}")
+        self._fit_replay_buffer()
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         return [self.actor.optimizer, self.critic.optimizer]
@@ -215,20 +249,22 @@ class FederatedDDPG(Federation, DDPG):
         raw_obs = self._last_obs.reshape(*shape, -1)  # type: ignore[union-attr]
         for step in range(n_rollout_steps):
             scaled_actions = self._explore(raw_obs, noise[step])
-            actions = self.policy.unscale_action(scaled_actions).reshape(env.num_envs, -1)
-            new_raw_obs, raw_rewards, flat_dones, infos = env.step(actions)
+            buffer_actions = scaled_actions.reshape(env.num_envs, -1)
+            actions = self.policy.unscale_action(buffer_actions)
+            new_obs, rewards, dones, infos = env.step(actions)  # names as in SB3, whose callbacks read them
             self.num_timesteps += n_active
             self.client_steps[self.present] += self.n_envs_per_client
             callback.update_locals(locals())
-            if not callback.on_step():
-                return False
-            next_raw, dones, rewards = new_raw_obs.reshape(*shape, -1), flat_dones.reshape(shape), raw_rewards.reshape(shape)  # type: ignore[union-attr]
+            goes_on = callback.on_step()
+            next_raw, ends, raw_rewards = new_obs.reshape(*shape, -1), dones.reshape(shape), rewards.reshape(shape)  # type: ignore[union-attr]
             self.normalizer.update_obs(next_raw, present)
-            self.normalizer.scale_reward(rewards, dones, present)  # for its statistics: the buffer keeps raw rewards
-            final_obs, terminations = self._ends(next_raw, dones, infos)
-            self.replay_buffer.add(raw_obs, final_obs, scaled_actions, rewards, terminations, present)
-            self.noise.reset(dones)
-            raw_obs, self._last_obs = next_raw, new_raw_obs  # type: ignore[assignment]
+            self.normalizer.scale_reward(raw_rewards, ends, present)  # for its statistics: the buffer keeps raw rewards
+            final_obs, terminations = self._ends(next_raw, ends, infos)
+            self.replay_buffer.add(raw_obs, final_obs, scaled_actions, raw_rewards, terminations, present)
+            self.noise.reset(ends)
+            raw_obs, self._last_obs = next_raw, new_obs  # type: ignore[assignment]
+            if not goes_on:
+                return False
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             if (step + 1) % self.train_freq == 0 and self._ready().any():
                 started = time.perf_counter()
@@ -272,8 +308,7 @@ class FederatedDDPG(Federation, DDPG):
                 info = infos[client * self.n_envs_per_client + env]
                 next_obs[client, env] = info["terminal_observation"]
                 terminations[client, env] = not info.get("TimeLimit.truncated", False)
-                if "episode" in info:
-                    self._keep_episode(int(client), info["episode"])
+                self.note_episode(int(client), info)
         return next_obs, terminations
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -350,31 +385,3 @@ class FederatedDDPG(Federation, DDPG):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer", "normalizer"], []
-
-
-def _check_settings(model: FederatedDDPG) -> None:
-    """:raises ValueError: for settings out of range or that do not fit together, with the remedy"""
-    rollout_size, n_envs = model.rollout_size, model.n_envs_per_client
-    if rollout_size < 1 or rollout_size % n_envs:
-        raise ValueError(f"n_envs_per_client={n_envs} must divide rollout_size={rollout_size}, the steps per client and round")
-    if model.train_freq < 1 or (rollout_size // n_envs) % model.train_freq:
-        raise ValueError(
-            f"train_freq={model.train_freq} must be at least 1 and divide the {rollout_size // n_envs} steps of every "
-            "environment in a round (rollout_size / n_envs_per_client)"
-        )
-    if model.gradient_steps < 1 and model.gradient_steps != -1:
-        raise ValueError(
-            f"gradient_steps={model.gradient_steps} must be at least 1, or -1 for as many as there are new transitions"
-        )
-    if model.batch_size < 1 or model.learning_starts < 0:
-        raise ValueError(
-            f"batch_size={model.batch_size} must be at least 1 and learning_starts={model.learning_starts} at least 0"
-        )
-    if model.buffer_size <= model.learning_starts:
-        raise ValueError(
-            f"buffer_size={model.buffer_size} must be larger than learning_starts={model.learning_starts}; both are per client"
-        )
-    if not 0 < model.tau <= 1:
-        raise ValueError(f"tau={model.tau} must lie in (0, 1]")
-    if min(model.noise_theta, model.noise_sigma) < 0 or model.noise_dt <= 0:
-        raise ValueError("noise_theta and noise_sigma must not be negative, and noise_dt must be positive")

@@ -21,6 +21,7 @@ from sb3_fedguide.common.distributions import action_distribution, check_continu
 from sb3_fedguide.common.environments import FederationLike, as_federated_env
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation, PolicyLike
+from sb3_fedguide.common.keywords import check_policy, check_policy_keywords
 from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
@@ -30,6 +31,7 @@ from sb3_fedguide.common.stacked import clip_grad_norm_per_client
 from sb3_fedguide.common.training_log import RoundStatistics, record_training
 from sb3_fedguide.offline.pretraining import PretrainingConfig
 from sb3_fedguide.server.validation import UPLOAD_BOUND
+from sb3_fedguide.settings.ranges import check_ranges
 
 
 class FederatedPPO(Federation, PPO):
@@ -107,6 +109,8 @@ class FederatedPPO(Federation, PPO):
         device: th.device | str = "cpu",
         _init_setup_model: bool = True,
     ) -> None:
+        check_ranges(locals())
+        check_policy(policy, self.policy_aliases, type(self))
         env = as_federated_env(env, n_envs_per_client, clients, num_threads)
         self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
         check_sizes(rollout_size, batch_size, self.n_envs_per_client)
@@ -153,15 +157,10 @@ class FederatedPPO(Federation, PPO):
 
     def _setup_model(self) -> None:
         assert self.seed is not None
+        check_ranges(vars(self))  # those of subclasses, and of load()
+        check_policy_keywords(self.policy_class, self.policy_kwargs)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        self.rollout_buffer = FederatedRolloutBuffer(
-            self.n_steps,
-            self.n_clients,
-            self.n_envs_per_client,
-            self.observation_space,  # type: ignore[arg-type]
-            action_distribution(self.action_space).action_dim,
-        )
         kwargs = {**self.policy_kwargs, "n_clients": self.n_clients, "init_seed": integer_seed(self.seed, Role.INIT)}
         if self.partial:
             kwargs.update(optimizer_class=ParticipationAdam, optimizer_kwargs={"eps": 1e-5})  # SB3's epsilon for Adam
@@ -177,7 +176,21 @@ class FederatedPPO(Federation, PPO):
             norm_reward=bool(self.normalize),
             shared=self.normalize == "shared",
         )
+        self._fit_copies()
         self._start_server()
+
+    def _fit_copies(self) -> None:
+        check_sizes(self.rollout_size, self.batch_size, self.n_envs_per_client)
+        self.n_steps = self.rollout_size // self.n_envs_per_client
+        self.n_envs = self.n_clients * self.n_envs_per_client
+        self.normalizer.reset_returns(self.n_envs_per_client)
+        self.rollout_buffer = FederatedRolloutBuffer(
+            self.n_steps,
+            self.n_clients,
+            self.n_envs_per_client,
+            self.observation_space,  # type: ignore[arg-type]
+            action_distribution(self.action_space).action_dim,
+        )
 
     def _prepare_training(self) -> None:
         """After the rollout, before the first minibatch: compute what the extra losses need, once per round."""
@@ -224,27 +237,30 @@ class FederatedPPO(Federation, PPO):
         obs = self.normalizer.normalize_obs(raw_obs)
         starts = self._last_episode_starts.reshape(shape)
         present = None if self.present.all() else self.present
-        dones = starts
-        for step in range(n_rollout_steps):
+        for n_steps in range(n_rollout_steps):
             mean = actor_mean(th.as_tensor(obs, device=self.device))
-            actions = distribution.decide(mean + noise[step]).cpu().numpy()
-            new_raw_obs, raw_rewards, flat_dones, infos = env.step(distribution.executed(actions))
+            drawn = distribution.decide(mean + noise[n_steps]).cpu().numpy()
+            actions = drawn.reshape(env.num_envs, *drawn.shape[2:])
+            clipped_actions = distribution.executed(drawn)
+            new_obs, rewards, dones, infos = env.step(clipped_actions)  # names as in SB3, whose callbacks read them
             self.num_timesteps += n_active
             callback.update_locals(locals())
-            if not callback.on_step():
-                return False
-            dones = flat_dones.reshape(shape)
-            next_raw = new_raw_obs.reshape(*shape, -1)  # type: ignore[union-attr]
+            goes_on = callback.on_step()
+            next_raw = new_obs.reshape(*shape, -1)  # type: ignore[union-attr]
+            ends = dones.reshape(shape)
             self.normalizer.update_obs(next_raw, present)
-            rewards = self.normalizer.scale_reward(raw_rewards.reshape(shape), dones, present)
-            rollout_buffer.add(raw_obs, obs, actions, rewards, starts)
-            for index in np.flatnonzero(flat_dones):
+            scaled_rewards = self.normalizer.scale_reward(rewards.reshape(shape), ends, present)
+            rollout_buffer.add(raw_obs, obs, drawn, scaled_rewards, starts)
+            for index in np.flatnonzero(dones):
                 self._end_episode(int(index), infos[index])
-            raw_obs, obs, starts = next_raw, self.normalizer.normalize_obs(next_raw), dones
+            raw_obs, obs, starts = next_raw, self.normalizer.normalize_obs(next_raw), ends
             if present is not None:  # a client that was away still has its episode to begin
-                starts = np.where(present[:, None], dones, rollout_buffer.episode_starts[step] > 0)
-        self._last_obs, self._last_episode_starts = new_raw_obs, np.asarray(starts, dtype=bool).reshape(-1)  # type: ignore[assignment]
-        self._finish_rollout(raw_obs, obs, dones)
+                starts = np.where(present[:, None], ends, rollout_buffer.episode_starts[n_steps] > 0)
+            if not goes_on or n_steps + 1 == n_rollout_steps:  # where the next rollout begins, whatever ends this one
+                self._last_obs, self._last_episode_starts = new_obs, np.asarray(starts, dtype=bool).reshape(-1)  # type: ignore[assignment]
+            if not goes_on:
+                return False
+        self._finish_rollout(raw_obs, obs, ends)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
@@ -265,8 +281,7 @@ class FederatedPPO(Federation, PPO):
 
     def _end_episode(self, index: int, info: dict[str, Any]) -> None:
         client, env = divmod(index, self.n_envs_per_client)
-        if "episode" in info:
-            self._keep_episode(client, info["episode"])
+        self.note_episode(client, info)
         if info.get("TimeLimit.truncated", False):
             final = np.asarray(info["terminal_observation"])
             self.rollout_buffer.add_truncation(client, env, final, self.normalizer.normalize_obs(final, client))

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-import time
 from abc import abstractmethod
-from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.vec_env import VecEnv
 
 from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback, RoundProgressCallback, round_callbacks
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
+from sb3_fedguide.common.environments import FederatedEnvironments
 from sb3_fedguide.common.environments import FederationLike as FederationLike
-from sb3_fedguide.common.environments import as_federated_env
+from sb3_fedguide.common.episodes import EpisodeStatistics
 from sb3_fedguide.common.exchange import Exchange
 from sb3_fedguide.common.faults import check_policies, in_round, warn_of_new_episodes
+from sb3_fedguide.common.keywords import CheckedKeywords
 from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize, check_normalize
 from sb3_fedguide.common.parameters import ParameterFiles
 from sb3_fedguide.common.participation import ParticipationAdam
@@ -33,9 +31,9 @@ from sb3_fedguide.common.resumable import Resumable
 from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.common.warm_start import WarmStart
 from sb3_fedguide.offline.pretraining import PretrainingConfig
-from sb3_fedguide.server.participants import check_fraction, draw_participants, n_participants
+from sb3_fedguide.server.participants import draw_participants, n_participants
 from sb3_fedguide.server.strategy import Strategy
-from sb3_fedguide.server.validation import UPLOAD_BOUND, check_bound
+from sb3_fedguide.server.validation import UPLOAD_BOUND
 
 if TYPE_CHECKING:
     from sb3_fedguide.engines.engine import Engine
@@ -44,7 +42,7 @@ PolicyLike = str | type[ActorCriticPolicy]
 SelfFederation = TypeVar("SelfFederation", bound="Federation")
 
 
-class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
+class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exchange, WarmStart, ParameterFiles, Resumable):
     """Mixin for SB3 algorithms that train all clients of a family in lockstep.
 
     A method names the server's side in :attr:`server_method` (or makes it, with :meth:`_make_strategy`), and defines the
@@ -55,8 +53,6 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
     normalizer: FederatedNormalizer
     rollout_size: int
     gamma: float
-    #: of each client's last finished episodes: return, length, seconds
-    episode_infos: list[deque[dict[str, float]]]
 
     def _init_federation(
         self,
@@ -69,10 +65,7 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
         upload_bound: float | None = UPLOAD_BOUND,
     ) -> None:
         """Called by a subclass's constructor, before SB3's."""
-        check_fraction(client_fraction)
         check_normalize(normalize)
-        if not 0.0 <= bc_weight <= 1.0:
-            raise ValueError(f"bc_weight={bc_weight} must lie in [0, 1]")
         self.client_ids: list[int] = [] if env is None else list(env.client_ids)
         self.n_envs_per_client = 1 if env is None else env.n_envs_per_client
         self.family = None if env is None else env.family
@@ -82,7 +75,6 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
         self.pretraining_config = PretrainingConfig.model_validate(pretraining or {})
         self.cache_dir = cache_dir
         self.client_fraction = client_fraction
-        check_bound(upload_bound)
         self.upload_bound = upload_bound
         #: environment steps that one step of a round counts; by default those of the clients that take part here
         self.steps_at_once: int | None = None
@@ -103,22 +95,10 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
         self.strategy: Strategy | None = None
         self._streams: dict[Role, list[np.random.Generator]] = {}
 
-    @staticmethod
-    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        """Accept whatever a federation can be made of wherever SB3 takes an environment, as in ``load(path, env=...)``."""
-        wrapped = as_federated_env(env)
-        assert wrapped is not None
-        return BaseAlgorithm._wrap_env(wrapped, verbose, monitor_wrapper)
-
     @property
     def n_clients(self) -> int:
         """Clients that live here."""
         return len(self.client_ids)
-
-    @property
-    def environment_steps(self) -> int:
-        """Steps of all clients together, in training and in tests of what the server sent."""
-        return self.num_timesteps + self.test_steps
 
     @property
     def n_participants(self) -> int:
@@ -177,16 +157,6 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
         for optimizer in self._optimizers():
             if isinstance(optimizer, ParticipationAdam):
                 optimizer.make_state()
-
-    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
-        """:raises ValueError: for a policy of which there is no stacked one, with what to do"""
-        if policy_name in self.policy_aliases:
-            return self.policy_aliases[policy_name]
-        reason = {
-            "MultiInputPolicy": "observations that are a Dict are flattened for it",
-            "CnnPolicy": "images are flattened for it, and there are no convolutions",
-        }.get(policy_name, "there is no other")
-        raise ValueError(f"policy={policy_name!r}: a federation's policy is 'MlpPolicy'; {reason}")
 
     def learn(
         self: SelfFederation,
@@ -266,8 +236,12 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
         self.normalizer.begin_round(self.present)
         try:
             return self._train_round(callbacks)
-        except ClientError:
-            self._check_experience()  # what an environment returned explains an action that is not finite
+        except BaseException as error:
+            try:
+                if isinstance(error, ClientError):
+                    self._check_experience()  # what an environment returned explains an action that is not finite
+            finally:
+                self._last_obs = None  # the environments stand in the middle of a step: the next learn() resets them
             raise
 
     @abstractmethod
@@ -293,36 +267,8 @@ class Federation(Exchange, WarmStart, ParameterFiles, Resumable):
             self.normalizer.reset_returns()
             self.normalizer.update_obs(self._last_obs.reshape(self.n_clients, self.n_envs_per_client, -1))  # type: ignore
         if environments_were_reset or not hasattr(self, "episode_infos"):
-            self.episode_infos = [deque(maxlen=self._stats_window_size) for _ in range(self.n_clients)]
-
-    def _keep_episode(self, client: int, episode: dict[str, Any]) -> None:
-        """Keep a finished episode's figures; what else an environment says of it may be anything."""
-        self.episode_infos[client].append({name: episode[name] for name in ("r", "l", "t")})
-
-    def mean_episode_return(self) -> float:
-        """Average over clients of each one's mean return over its last finished training episodes."""
-        means = [np.mean([info["r"] for info in infos]) for infos in self.episode_infos if infos]
-        return float(np.mean(means)) if means else float("nan")
-
-    def dump_logs(self, iteration: int = 0) -> None:
-        """Write one round's log: each client is averaged first, so that those with short episodes do not dominate."""
-        for client, infos in zip(self.client_ids, self.episode_infos, strict=True):
-            if infos:
-                self.record_client(client, "ep_rew_mean", float(np.mean([info["r"] for info in infos])))
-        lengths = [np.mean([info["l"] for info in infos]) for infos in self.episode_infos if infos]
-        if lengths:
-            self.logger.record("rollout/ep_rew_mean", self.mean_episode_return())
-            self.logger.record("rollout/ep_len_mean", float(np.mean(lengths)))
-        elapsed = max((time.time_ns() - self.start_time) / 1e9, 1e-9)
-        self.logger.record("time/round", iteration)
-        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
-        self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
-        self.logger.record("time/total_timesteps", self.environment_steps, exclude="tensorboard")
-        self.logger.dump(step=self.environment_steps)
-
-    def record_client(self, client_id: int, key: str, value: float) -> None:
-        """Log one client's value; kept off the terminal, where long keys collide and eight clients drown the rest."""
-        self.logger.record(f"client_{client_id}/{key}", value, exclude=("stdout", "log"))
+            self.begin_episodes()
+        self.gather_episodes()
 
     def predict(  # type: ignore[override]
         self,

@@ -157,9 +157,9 @@ class FederatedNormalizer:
         """What rewards are divided by, ``(n_clients,)``; ones where rewards are not normalised."""
         return np.sqrt(self.ret.var + self.EPSILON) if self.norm_reward else np.ones_like(self.ret.var)
 
-    def reset_returns(self) -> None:
-        """Forget the running returns: the environments have been reset."""
-        self.returns[:] = 0.0
+    def reset_returns(self, n_envs_per_client: int | None = None) -> None:
+        """Forget the running returns: the environments have been reset, or are ``n_envs_per_client`` new ones."""
+        self.returns = np.zeros((len(self.returns), n_envs_per_client or self.returns.shape[1]))
 
     def warm_start(self, index: int, mean: np.ndarray, var: np.ndarray, count: int) -> None:
         """Start client ``index``'s observation statistics from its own offline data."""

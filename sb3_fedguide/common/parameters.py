@@ -17,7 +17,7 @@ from torch import nn
 
 from fed_envs.files import atomic_file
 from sb3_fedguide.common.array_files import array_mismatches, read_arrays, write_arrays
-from sb3_fedguide.common.export import SETTINGS, ClientPolicies, ClientPolicy, Normalization
+from sb3_fedguide.common.export import SETTINGS, ClientPolicies, ClientPolicy, Normalization, client_settings
 from sb3_fedguide.common.normalization import Normalize
 from sb3_fedguide.common.spaces import describe_space, space_from
 from sb3_fedguide.common.stacked import client_state, to_arrays, to_tensors
@@ -44,14 +44,6 @@ class ParameterFiles(ClientPolicies):
         target.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(target, "wb") as file:
             super().save(file, *args, **kwargs)  # type: ignore[arg-type]
-
-    @classmethod
-    def load(cls, path: str | Path | io.BufferedIOBase, *args: Any, **kwargs: Any) -> Any:
-        """As in SB3, whose archive is unpickled: it can execute any code, so load only what you trust.
-
-        :meth:`import_parameters` reads a file of :meth:`export_parameters` from anybody.
-        """
-        return super().load(path, *args, **kwargs)
 
     def export_parameters(self, path: str | Path) -> None:
         """Write what was learned as plain arrays with a JSON header (npz, no pickle): every client's policy and
@@ -152,15 +144,16 @@ def _read(model: ParameterFiles, path: str | Path) -> None:
 def read_policies(path: str | Path, replaced: dict[str, np.ndarray] | None = None) -> dict[int, ClientPolicy]:
     """The policies in a file of :meth:`ParameterFiles.export_parameters`, by client; no federation is made.
 
-    :param replaced: parameters of policies to put in place of the file's, ``(n_clients, ...)`` each
+    :param replaced: arrays of :meth:`ParameterFiles.acting_arrays` to put in place of the file's
     :raises ValueError: for a file that is absent, damaged or of another version
     """
     header, arrays = _open(path)
-    put = {f"policy/{name}": array for name, array in (replaced or {}).items()}
+    put = {name if name.startswith("normalizer/") else f"policy/{name}": array for name, array in (replaced or {}).items()}
     mismatches = array_mismatches({**arrays, **put}, arrays)
-    if mismatches or (broken := _broken({**arrays, **put})):
+    arrays = {**arrays, **put}
+    if mismatches or (broken := _broken(arrays)):
         raise ValueError(f"{path} and the policies to put in place of its own: {(mismatches or broken)[0]}")
-    policies = take_prefix({**arrays, **put}, "policy/")
+    policies = take_prefix(arrays, "policy/")
     if "spaces" not in header:
         raise ValueError(
             f"{path} is of an earlier version, which wrote no spaces; load it into a model of the same settings with "
@@ -210,7 +203,7 @@ def _identity(model: ParameterFiles) -> dict[str, Any]:
 
 def _outside(model: ParameterFiles) -> dict[str, Any]:
     """What a policy needs beside the arrays where there is no federation, see :func:`read_policies`."""
-    settings = {name: _plain(getattr(model, name)) for name in SETTINGS[model.learner]}
+    settings = {name: _plain(value) for name, value in client_settings(model).items()}
     return {
         "learner": model.learner,
         "spaces": {

@@ -9,6 +9,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_fedguide.common.environments import check_copies
+
 
 class FederatedSamples(NamedTuple):
     """One minibatch of every client: leading dimensions ``(n_clients, batch)``."""
@@ -24,10 +26,7 @@ class FederatedSamples(NamedTuple):
 
 def check_sizes(rollout_size: int, batch_size: int, n_envs_per_client: int) -> None:
     """:raises ValueError: for sizes of a client's rollout that do not fit together"""
-    if rollout_size % n_envs_per_client:
-        raise ValueError(
-            f"n_envs_per_client={n_envs_per_client} must divide rollout_size={rollout_size}, the steps per client and round"
-        )
+    check_copies(rollout_size, n_envs_per_client)
     if not 1 < batch_size <= rollout_size:
         raise ValueError(f"batch_size={batch_size} must lie between 2 and rollout_size={rollout_size}; both are per client")
 

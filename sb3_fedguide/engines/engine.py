@@ -113,6 +113,7 @@ class Engine(ABC):
         for k, reply in replies.items():
             if reply.observations is not None:
                 model.rollout_buffer.observations[:, self.groups[k]] = reply.observations  # type: ignore[attr-defined]
+        model.gather_episodes()
         self._record(model, replies)
         warn_of_new_episodes(sorted(client for reply in replies.values() for client in reply.restarted))
         callbacks.on_rollout_end()

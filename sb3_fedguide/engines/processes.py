@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import os
 import signal
@@ -27,6 +28,7 @@ class Processes(Engine):
 
     def _start(self, blobs: Sequence[bytes]) -> None:
         context = multiprocessing.get_context("spawn")
+        atexit.register(self._end)  # before multiprocessing's own, which waits for workers after a SIGTERM
         # One thread each: what several libraries start by themselves gets into the other workers' way.
         before = os.environ.get("OMP_NUM_THREADS")
         os.environ["OMP_NUM_THREADS"] = "1"
@@ -44,7 +46,14 @@ class Processes(Engine):
             else:
                 os.environ["OMP_NUM_THREADS"] = before
         for pipe in self._pipes:
-            problem = _received(pipe, "while it started")
+            try:
+                problem = _received(pipe)
+            except EngineError:
+                self._end()
+                raise EngineError(
+                    "a worker process ended while it started: it imports the script that made the engine, so that a script's "
+                    'own work has to stand below `if __name__ == "__main__":`, and there has to be a file of it'
+                ) from None
             if problem is not None:
                 self._end()
                 raise ValueError(f"this federation cannot be made in another process: {problem}")
@@ -55,23 +64,25 @@ class Processes(Engine):
                 self._pipes[k].send(round)
             except OSError as error:
                 raise EngineError(f"a worker process is gone: {error}") from error
-        return {k: _received(self._pipes[k], "in the round") for k in rounds}
+        return {k: _received(self._pipes[k]) for k in rounds}
 
     def _end(self) -> None:
+        atexit.unregister(self._end)
         for pipe in self._pipes:
             pipe.close()  # the process sees the end of the pipe
         for process in self._processes:
             process.join(timeout=5)
             if process.is_alive():
                 process.kill()
+                process.join()
         self._pipes, self._processes = [], []
 
 
-def _received(pipe: Connection, when: str) -> Any:
+def _received(pipe: Connection) -> Any:
     try:
         reply = pipe.recv()
     except (EOFError, OSError) as error:
-        raise EngineError(f"a worker process ended {when}; go on from the last checkpoint") from error
+        raise EngineError("a worker process ended in the round; go on from the last checkpoint") from error
     if isinstance(reply, Exception) and not isinstance(reply, ClientError):
         raise reply
     return reply
@@ -79,7 +90,9 @@ def _received(pipe: Connection, when: str) -> Any:
 
 def _work(pipe: Connection, blob: bytes) -> None:
     """A worker process: a round for every message, until the pipe is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the main process's, which closes the pipe
+    # A terminal and a service manager signal all processes; to stop is the main process's, which closes the pipe.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     try:
         worker = Worker(blob)
     except Exception as error:

@@ -17,7 +17,7 @@ from flwr.supercore.runtime import RuntimeHttpClient
 from sb3_fedguide.common.site import PARAMETERS, SITE
 from sb3_fedguide.flower.certificates import LOOPBACK
 from sb3_fedguide.flower.client_app import FINISHED, app
-from sb3_fedguide.flower.processes import FlowerProcess, environment, free_port, runtime_version
+from sb3_fedguide.flower.processes import FlowerProcess, environment, free_port, loopback_without_proxy, runtime_version
 
 _POLL_SECONDS = 0.2
 #: The SuperLink refuses a key for up to a minute after its SuperNode was killed.
@@ -49,6 +49,7 @@ class ClientNode:
             "--node-config", f"config='{config}'", "--isolation", "process", "--host", LOOPBACK,
         ]  # fmt: skip
         self._env = environment(folder)
+        os.environ.update(loopback_without_proxy())  # this process and its forks ask the SuperNode as well
 
     @property
     def finished(self) -> bool:

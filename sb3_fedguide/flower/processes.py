@@ -39,7 +39,18 @@ def check_flower_version() -> None:
 
 def environment(home: Path) -> dict[str, str]:
     """Environment of a Flower process whose own files are in ``home``."""
-    return {"OMP_NUM_THREADS": "1", **os.environ, "FLWR_HOME": str(home)}
+    return {"OMP_NUM_THREADS": "1", **os.environ, **loopback_without_proxy(), "FLWR_HOME": str(home)}
+
+
+def loopback_without_proxy() -> dict[str, str]:
+    """The variables that keep this machine's own addresses off a proxy, whatever else they say.
+
+    Flower's processes talk to each other over the loopback device, and follow ``http_proxy`` and ``https_proxy``.
+    """
+    given = os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or ""  # as httpx and curl: the lower case first
+    hosts = [host.strip() for host in given.split(",") if host.strip()]
+    hosts += [host for host in (LOOPBACK, "localhost", "::1") if host not in hosts and "*" not in hosts]
+    return dict.fromkeys(("no_proxy", "NO_PROXY"), ",".join(hosts))
 
 
 def runtime_version(component: str) -> RuntimeVersionHttpInterceptor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -21,7 +22,7 @@ from flwr.supercore.runtime import RuntimeHttpClient
 from sb3_fedguide import __version__
 from sb3_fedguide.cli.run import EXIT_FAILED
 from sb3_fedguide.flower.certificates import CA, LOOPBACK, SERVER, SERVER_KEY
-from sb3_fedguide.flower.processes import FlowerProcess, environment, free_port, runtime_version
+from sb3_fedguide.flower.processes import FlowerProcess, environment, free_port, loopback_without_proxy, runtime_version
 from sb3_fedguide.flower.proxy import FleetProxy, ProxyServer
 from sb3_fedguide.flower.server_app import CONFIG
 
@@ -59,6 +60,7 @@ class ServerNode:
         self._listen, self._certificates, self._keys, self._folder = listen, certificates, keys, folder
         self._ca = certificates / CA
         self._env = {**environment(folder), CONFIG: str(config)}
+        os.environ.update(loopback_without_proxy())  # this process asks the SuperLink as well
         self._address = f"{LOOPBACK}:{free_port()}"
 
     def run(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import logging
@@ -29,8 +30,17 @@ CACHE_VARIABLE = "FEDGUIDE_CACHE"
 
 
 def cache_folder(path: str | Path | None = None) -> Path:
-    """``path``, or ``$FEDGUIDE_CACHE``, or ``~/.cache/fedguide``."""
-    return Path(path or os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "fedguide").expanduser()
+    """``path``, or ``$FEDGUIDE_CACHE``, or ``~/.cache/fedguide``; absolute, whatever the working directory becomes.
+
+    :raises ValueError: for the home folder of a user who does not exist
+    """
+    given = Path(path or os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "fedguide")
+    try:
+        return given.expanduser().absolute()
+    except RuntimeError as error:
+        raise ValueError(
+            f"the cache folder {given}: {error}; give another one with --cache-dir or ${CACHE_VARIABLE}"
+        ) from None
 
 
 def content_key(**parts: Any) -> str:
@@ -74,10 +84,11 @@ def keep_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 def warn_not_kept(path: Path, error: Exception) -> None:
     """Say that a cache entry could not be written, and what to do."""
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
     logger.warning(
-        "%s could not be kept (%s) and will be made again by the next run; free some space there, or choose another cache "
-        "folder with --cache-dir or $%s",
-        path, getattr(error, "strerror", None) or error, CACHE_VARIABLE,
+        "%s could not be kept (%s) and will be made again by the next run; %schoose another cache folder with --cache-dir or "
+        "$%s",
+        path, getattr(error, "strerror", None) or error, "free some space there, or " if full else "", CACHE_VARIABLE,
     )  # fmt: skip
 
 

@@ -23,6 +23,8 @@ class OfflineData:
     :param rewards: in the environment's own scale, float32, ``(n,)``
     :param next_observations: float32, ``(n, obs_dim)``; the final observation where an episode ends
     :param terminations: bool, ``(n,)``; a time limit is not a termination
+    :param truncations: bool, ``(n,)``, where a time limit or the end of the record cut an episode; ``None`` where the
+        observations tell: a row that does not lead to the next one is its episode's last
     :raises ValueError: for arrays that do not fit together, are empty or not finite
     """
 
@@ -31,6 +33,7 @@ class OfflineData:
     rewards: np.ndarray
     next_observations: np.ndarray
     terminations: np.ndarray
+    truncations: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name, n_dims in _FIELDS.items():
@@ -39,13 +42,23 @@ class OfflineData:
             if array.ndim != n_dims:
                 raise ValueError(f"offline data: {name} needs {n_dims} dimension(s), got shape {array.shape}")
             if not np.isfinite(array).all():
-                raise ValueError(f"offline data: {name} has non-finite entries")
+                wrong = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
+                raise ValueError(
+                    f"offline data: {name} has non-finite entries in {wrong.sum()} of {len(array)} rows, first in row "
+                    f"{wrong.argmax()}: leave these episodes out"
+                )
             object.__setattr__(self, name, array)
         shapes = {name: getattr(self, name).shape for name in _FIELDS}
         if len({shape[0] for shape in shapes.values()}) != 1 or len(self) == 0:
             raise ValueError(f"offline data: every array needs the same number of rows, at least one; got {shapes}")
         if self.observations.shape != self.next_observations.shape:
             raise ValueError(f"offline data: observations and next_observations differ in shape: {shapes}")
+        if self.truncations is not None:
+            cut = np.ascontiguousarray(self.truncations, dtype=bool)
+            if cut.shape != (len(self),):
+                raise ValueError(f"offline data: truncations need shape {(len(self),)}, got {cut.shape}")
+            # What the observations say already is not kept, so that the same data have one content.
+            object.__setattr__(self, "truncations", cut if (cut & ~self._seen_ends()).any() else None)
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -53,6 +66,9 @@ class OfflineData:
     @cached_property
     def episode_ends(self) -> np.ndarray:
         """Bool ``(n,)``: the row is the last of its episode, by termination, time limit or end of the record."""
+        return self._seen_ends() if self.truncations is None else self._seen_ends() | self.truncations
+
+    def _seen_ends(self) -> np.ndarray:
         ends = self.terminations.copy()
         ends[:-1] |= (self.next_observations[:-1] != self.observations[1:]).any(axis=1)
         ends[-1] = True
@@ -64,8 +80,9 @@ class OfflineData:
         return arrays_hash(self.arrays())
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The five arrays by name."""
-        return {name: getattr(self, name) for name in _FIELDS}
+        """The arrays by name; truncations where they say more than the observations."""
+        arrays = {name: getattr(self, name) for name in _FIELDS}
+        return arrays if self.truncations is None else {**arrays, "truncations": self.truncations}
 
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean and variance of the observations, float64, ``(obs_dim,)`` each."""

@@ -74,11 +74,14 @@ def client_datasets(
     for done, client in enumerate(clients):
         if progress is not None:
             progress(done, len(clients))
-        if dataset is not None:
-            result.append(_given(dataset, client, size, seed, env_spaces or _spaces(known, client)))
-        elif known is not None:
-            folder = dataset_folder(known, client, size, seed, cache_dir, policy)
-            result.append(_made_on_the_spot(folder, known, client, size or default_size(known), seed, policy))
+        try:
+            if dataset is not None:
+                result.append(_given(dataset, client, size, seed, env_spaces or _spaces(known, client)))
+            elif known is not None:
+                folder = dataset_folder(known, client, size, seed, cache_dir, policy)
+                result.append(_made_on_the_spot(folder, known, client, size or default_size(known), seed, policy))
+        except ValueError as error:
+            raise ValueError(f"offline data of client {client}: {error}") from error
     if progress is not None:
         progress(len(clients), len(clients))
     return result

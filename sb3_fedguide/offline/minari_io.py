@@ -18,6 +18,9 @@ from minari.serialization import deserialize_space
 
 from sb3_fedguide.offline.data import OfflineData
 
+#: How far an action may lie outside its bounds, relative to them: what a conversion between float types leaves.
+ROUNDING = 1e-5
+
 __all__ = ["check_spaces", "find_dataset", "local_root", "read_minari", "write_minari"]
 
 
@@ -70,9 +73,8 @@ def read_minari(data_path: Path, max_rows: int | None = None, rng: np.random.Gen
         order = np.arange(storage.total_episodes)
         if rng is not None:
             rng.shuffle(order)
-        columns: dict[str, list[np.ndarray]] = {
-            name: [] for name in ("observations", "actions", "rewards", "next_observations", "terminations")
-        }
+        names = ("observations", "actions", "rewards", "next_observations", "terminations", "truncations")
+        columns: dict[str, list[np.ndarray]] = {name: [] for name in names}
         missing = max_rows if max_rows is not None else storage.total_steps
         for episode in storage.get_episodes(order):
             rows = min(len(episode["rewards"]), missing)
@@ -81,12 +83,29 @@ def read_minari(data_path: Path, max_rows: int | None = None, rng: np.random.Gen
             columns["next_observations"].append(observations[1 : rows + 1])
             for name in ("actions", "rewards", "terminations"):
                 columns[name].append(episode[name][:rows])
+            columns["truncations"].append(np.arange(rows) == rows - 1)  # whatever its flags say, the record ends there
             missing -= rows
             if missing <= 0:
                 break
-        return OfflineData(**{name: np.concatenate(parts) for name, parts in columns.items()})
+        data = OfflineData(**{name: np.concatenate(parts) for name, parts in columns.items()})
     except Exception as error:  # h5py, json, Gymnasium and NumPy each have their own for a file that is not what it should be
         raise ValueError(f"{data_path} is not a readable Minari dataset of Box spaces: {error}") from error
+    _check_actions(data_path, data.actions, storage.action_space)
+    return data
+
+
+def _check_actions(data_path: Path, actions: np.ndarray, space: gym.Space) -> None:
+    """:raises ValueError: for actions outside the space that the dataset declares"""
+    assert isinstance(space, gym.spaces.Box)
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    beyond = np.maximum(low - actions, actions - high).max(axis=1)
+    wrong = beyond > ROUNDING * np.maximum(1.0, np.abs(np.where(np.isfinite(high), high, 1.0)).max())
+    if wrong.any():
+        raise ValueError(
+            f"the dataset at {data_path} has actions outside its own action space {space} in {wrong.sum()} of {len(actions)} "
+            f"rows, by up to {beyond.max():.3g}: clients would imitate what no environment executes. Record the actions that "
+            "were executed (clipped to the space), or leave these episodes out"
+        )
 
 
 def find_dataset(dataset: str) -> Path:

@@ -11,11 +11,11 @@ from sb3_fedguide.common.seeding import Role, seed_sequence
 from sb3_fedguide.server.averaging import Averaging, averaged_prefixes, check_averaging
 from sb3_fedguide.server.moments import ObservationMoments
 from sb3_fedguide.server.ot_moe import OTMoE
-from sb3_fedguide.server.participants import check_fraction
 from sb3_fedguide.server.payload import DDPG_ACTOR, DDPG_CRITIC, PPO_ACTOR, PPO_CRITIC
 from sb3_fedguide.server.strategy import Composite, Strategy
 from sb3_fedguide.server.svrpg import SVRPG
-from sb3_fedguide.server.validation import UPLOAD_BOUND, check_bound
+from sb3_fedguide.server.validation import UPLOAD_BOUND
+from sb3_fedguide.settings.ranges import check_ranges
 
 Settings = Mapping[str, Any]
 #: Makes a strategy from complete settings, the number of clients and the federation's seed.
@@ -136,8 +136,7 @@ def make_strategy(algorithm: str, settings: Settings, n_clients: int, seed: int)
     :raises ValueError: for unknown settings, or values out of range
     """
     complete = complete_settings(algorithm, settings)
-    check_fraction(complete["client_fraction"])
-    check_bound(complete["upload_bound"])
+    check_ranges(complete)
     strategy = find_method(algorithm).make(complete, n_clients, seed)
     if complete["normalize"] == "shared":
         moments = ObservationMoments(complete.get("aggregator", "mean"), complete.get("trim_fraction", 0.25))

@@ -12,12 +12,6 @@ def n_participants(client_fraction: float, n_clients: int) -> int:
     return max(1, round(client_fraction * n_clients))
 
 
-def check_fraction(client_fraction: float) -> None:
-    """:raises ValueError: for a fraction outside (0, 1]"""
-    if not 0.0 < client_fraction <= 1.0:
-        raise ValueError(f"client_fraction={client_fraction} must lie in (0, 1]: it is the share of clients in each round")
-
-
 def draw_participants(seed: int, round: int, n_clients: int, n_present: int) -> np.ndarray:
     """Who takes part in a round, ``(n_clients,)`` bool, drawn without replacement from the server's stream of that round."""
     present = np.zeros(n_clients, dtype=bool)

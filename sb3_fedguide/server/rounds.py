@@ -21,9 +21,9 @@ class Rounds:
         self.strategy = strategy
         #: clients that have missed what others received, and have to catch up before they train again
         self.outdated: set[int] = set()
-        #: bytes that all clients together have sent and received
-        self.bytes_up = 0
-        self.bytes_down = 0
+        #: bytes that all clients together have sent and received, and what of them was before the first round
+        self.bytes_up = self.bytes_down = 0
+        self.offline_bytes_up = self.offline_bytes_down = 0
         #: figures of the last exchange, by log key
         self.figures: dict[str, float] = {}
 
@@ -59,13 +59,30 @@ class Rounds:
         if any(broadcasts.values()):  # what the others received is what the absent and the rejected have missed
             self.outdated |= {*absent, *self.strategy.rejected}
         up, down = payload_bytes(uploads), payload_bytes(broadcasts)
-        self.bytes_up += up
-        self.bytes_down += down
+        self.count(up, down, offline=round == 0)
         self.figures = {f"federated/{key}": value for key, value in self.strategy.metrics.items()}
         self.figures["federated/bytes_up"] = up
         self.figures["federated/bytes_down"] = down
         self.figures["federated/bytes_total"] = self.bytes_up + self.bytes_down
+        self.figures["federated/bytes_offline"] = self.offline_bytes_up + self.offline_bytes_down
         return broadcasts
+
+    def count(self, up: int, down: int, offline: bool) -> None:
+        """Add to the bytes; ``offline`` where they come once, before the first round."""
+        self.bytes_up += up
+        self.bytes_down += down
+        if offline:
+            self.offline_bytes_up += up
+            self.offline_bytes_down += down
+
+    @property
+    def bytes_counted(self) -> list[int]:
+        """All that was counted, for a checkpoint; those of earlier versions do not tell what was offline."""
+        return [self.bytes_up, self.bytes_down, self.offline_bytes_up, self.offline_bytes_down]
+
+    @bytes_counted.setter
+    def bytes_counted(self, saved: Sequence[int]) -> None:
+        self.bytes_up, self.bytes_down, self.offline_bytes_up, self.offline_bytes_down = [*saved, 0, 0][:4]
 
 
 def participants(clients: Sequence[int], seed: int, round: int, client_fraction: float) -> list[int]:

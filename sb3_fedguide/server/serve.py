@@ -173,8 +173,8 @@ class Server:
         return {client: request for client in sorted(there if members is None else there & set(members))}
 
     def _count_trunk(self, replies: Mapping[int, Message], sent: Payload) -> None:
-        self.rounds.bytes_up += payload_bytes({client: reply.payload for client, reply in replies.items()})
-        self.rounds.bytes_down += payload_bytes({client: sent for client in replies})
+        uploads = {client: reply.payload for client, reply in replies.items()}
+        self.rounds.count(payload_bytes(uploads), payload_bytes(dict.fromkeys(replies, sent)), offline=True)
 
     def _preparations(self) -> dict[int, Message]:
         """Requests to those who have not been through the offline stage."""
@@ -365,7 +365,7 @@ class Server:
             "server": self.clients.facts,
             "attributes": freeze({name: getattr(self, name) for name in _ATTRIBUTES}),
             "outdated": sorted(self.rounds.outdated),
-            "bytes": [self.rounds.bytes_up, self.rounds.bytes_down],
+            "bytes": self.rounds.bytes_counted,
             "clients": self.clients.save_state(),
             "strategy": None if self.rounds.strategy is None else self.rounds.strategy.save_state(),
             "trunk": None if self.trunk is None else self.trunk.save_state(),
@@ -390,7 +390,7 @@ class Server:
         for name, value in thaw(state["attributes"]).items():
             setattr(self, name, value)
         self.rounds.outdated = set(state["outdated"])
-        self.rounds.bytes_up, self.rounds.bytes_down = state["bytes"]
+        self.rounds.bytes_counted = state["bytes"]
         self.clients.load_state(state["clients"])
         if self.rounds.strategy is not None:
             self.rounds.strategy.load_state(state["strategy"])

@@ -147,12 +147,3 @@ def _difference(own: Form, usual: Form) -> str:
         if mine[name] != theirs[name]:
             return f"{name} has the shape {mine[name]}, those of the others {theirs[name]}"
     return f"{next(name for name in mine if name not in theirs)} is not expected"
-
-
-def check_bound(bound: float | None) -> None:
-    """:raises ValueError: for a bound that is not positive"""
-    if bound is not None and not 0 < bound < math.inf:
-        raise ValueError(
-            f"upload_bound={bound} must be positive: it says how far norms of uploads may exceed the clients' median; "
-            "None leaves out all checks of uploads"
-        )
