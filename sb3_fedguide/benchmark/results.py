@@ -174,6 +174,10 @@ def _spent(content: Mapping[str, Any]) -> dict[int, float]:
     return {int(round): steps / per_round for round, steps, _ in deployed["client_curve"]}
 
 
+#: Methods whose clients train a prior's trunk together.
+_WITH_PRIOR = ("fedguide", "fedguide-p", "fedguide-a")
+
+
 def _offline_bytes(content: Mapping[str, Any]) -> tuple[float | None, float | None]:
     """What went up and down before the first round; ``None`` where a file does not say and it was not nothing.
 
@@ -184,7 +188,7 @@ def _offline_bytes(content: Mapping[str, Any]) -> tuple[float | None, float | No
         return float(content["offline_bytes_up"]), float(content["offline_bytes_down"])
     prior = ((content.get("config") or {}).get("pretraining") or {}).get("prior", "auto")
     gaussian = prior == "gaussian" or (prior == "auto" and content["env"] == "Bandit2D")
-    return (0.0, 0.0) if gaussian or not str(content["algo"]).startswith("fedguide") else (None, None)
+    return (0.0, 0.0) if gaussian or content["algo"] not in _WITH_PRIOR else (None, None)
 
 
 def read_results(
