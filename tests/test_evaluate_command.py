@@ -18,10 +18,14 @@ SMALL = ["--rounds", "2", "--eval-episodes", "2", "--verbose", "0", "-params", "
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
+    """FedAvg to its last average, and with the hand-over after half of the run that its tuned settings have."""
     folder = tmp_path_factory.mktemp("logs")
-    for algo in ("local", "fedavg"):
-        assert main(["train", "--algo", algo, "--env", "Reacher", "-f", str(folder), *SMALL]) == 0
-    return {algo: folder / algo / "Reacher_1" for algo in ("local", "fedavg")}
+    for algo, more in (("local", []), ("fedavg", ["mix:1.0"]), ("fedavg", [])):
+        assert main(["train", "--algo", algo, "--env", "Reacher", "-f", str(folder), *SMALL, *more]) == 0
+    return {
+        "local": folder / "local" / "Reacher_1", "fedavg": folder / "fedavg" / "Reacher_1",
+        "handed over": folder / "fedavg" / "Reacher_2",
+    }  # fmt: skip
 
 
 def evaluated(run, *flags, output):
@@ -29,7 +33,7 @@ def evaluated(run, *flags, output):
     return json.loads(output.read_text())["policies"]
 
 
-@pytest.mark.parametrize("algo", ["local", "fedavg"])
+@pytest.mark.parametrize("algo", ["local", "fedavg", "handed over"])
 def test_the_last_evaluation_of_the_run_comes_out_again(runs, algo, tmp_path):
     summary = json.loads((runs[algo] / "summary.json").read_text())
     policies = evaluated(runs[algo], output=tmp_path / "result.json")

@@ -244,7 +244,7 @@ def test_fedavg_of_one_client_is_local(point_envs, small):
 def test_fedavg_averages_and_never_is_local(point_envs, small):
     averaged = FedAvg("MlpPolicy", point_envs(3), **small).learn(2 * 3 * 64)
     assert_same_parameters(parameters_of(averaged, 0), parameters_of(averaged, 2))
-    never = FedAvg("MlpPolicy", point_envs(3), average_until=0, **small).learn(2 * 3 * 64)
+    never = FedAvg("MlpPolicy", point_envs(3), average_every=3, **small).learn(2 * 3 * 64)
     local = Local("MlpPolicy", point_envs(3), **small).learn(2 * 3 * 64)
     assert_same_parameters(parameters_of(never, 2), parameters_of(local, 2))
 

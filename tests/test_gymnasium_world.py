@@ -109,7 +109,6 @@ ERRORS = {
     "--env Pendulum-v1 --client-kwargs nowhere.yml": "cannot read the configuration nowhere.yml",
     "--env Bandit2D --client-kwargs ROBOTS": "--client-kwargs and --env-kwargs are for the ids of registered environments",
     "--env Pendulm-v1": "unknown environment 'Pendulm-v1'",
-    "--env CartPole-v1,CartPole-v1": "Discrete",
 }
 
 

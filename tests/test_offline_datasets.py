@@ -246,7 +246,7 @@ def test_wrong_or_absent_datasets_are_refused(tmp_path: Path, monkeypatch: pytes
         client_datasets("Hopper", size=0)
     with pytest.raises(ValueError, match="clients 0 to 7"):
         client_datasets("Hopper", size=SIZE, clients=[9])
-    with pytest.raises(ValueError, match="pass dataset="):
+    with pytest.raises(ValueError, match="bring no offline data"):
         client_datasets(None, clients=[0])
 
 

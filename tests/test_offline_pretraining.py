@@ -179,5 +179,5 @@ def test_progress_names_the_pieces_and_is_silent_from_the_cache(tmp_path: Path) 
 
 
 def test_environments_of_ones_own_need_a_dataset(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="pass dataset="):
+    with pytest.raises(ValueError, match="bring no offline data"):
         Pretraining(None, [0, 1], cache_dir=tmp_path).datasets()

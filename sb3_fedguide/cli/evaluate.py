@@ -112,13 +112,17 @@ def _policies(arguments: argparse.Namespace, folder: Path, model: Federation) ->
 
     :raises ValueError: if the file of deployed policies is damaged or another model's
     """
+    import numpy as np
+
     from sb3_fedguide.cli.saved_run import read_deployed_policies
 
     deployed = read_deployed_policies(folder, model)
-    if not deployed:  # the exchange did not touch the policies: there is one of each client, and it is deployed
+    own = model.acting_arrays()
+    if all(np.array_equal(array, own[name]) for name, array in deployed.items() if not name.startswith("normalizer/")):
+        # the exchange did not touch the policies, or their observations' scale alone: there is one of each client
         if arguments.policy == "broadcast":
-            raise ValueError("this method sends its clients no policies, so there is no broadcast one; leave --policy out")
-        return {"deployed": {}}
+            raise ValueError("the last exchange sent no policies, so there is no broadcast one; leave --policy out")
+        return {"deployed": deployed}
     found = {"deployed": deployed, "broadcast": {}}
     return found if arguments.policy == "both" else {arguments.policy: found[arguments.policy]}
 

@@ -63,7 +63,7 @@ def load_model(folder: Path, config: Config, family: Family) -> Federation:
     from sb3_fedguide.cli.run_folder import PARAMETERS
 
     th.set_num_threads(1)
-    model = config.make(FederatedVecEnv(family), seed=0, device="cpu")
+    model = config.make(FederatedVecEnv(family, config.values["n_envs_per_client"]), seed=0, device="cpu")
     model.import_parameters(folder / PARAMETERS)
     return model
 

@@ -9,6 +9,16 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from fed_envs.faults import ClientError
+
+
+def truth(success: Any, client: int) -> bool:
+    """:raises ClientError: for an ``is_success`` that is neither true nor false, such as an array"""
+    try:
+        return bool(success)
+    except ValueError:
+        raise ClientError([client], f"the is_success of its environment is neither true nor false: {success!r}") from None
+
 
 class EpisodeStatistics(BaseAlgorithm):
     """Mixin of a federation: its clients' last finished episodes, and the round's log.
@@ -43,7 +53,7 @@ class EpisodeStatistics(BaseAlgorithm):
         success = info.get("is_success")
         episode = {name: info["episode"][name] for name in ("r", "l", "t")}  # what else it says may be anything
         if success is not None:
-            episode["is_success"] = float(success)
+            episode["is_success"] = float(truth(success, self.client_ids[client]))
         self.episode_infos[client].append(episode)
         self._share(episode)
 

@@ -15,6 +15,7 @@ from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
 from fed_envs.state import State, freeze, thaw
 from sb3_fedguide.common.callbacks import RoundCallback
+from sb3_fedguide.common.episodes import truth
 from sb3_fedguide.common.seeding import EVALUATION_SEED, Role
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def evaluate_federation(
             returns[index], lengths[index] = infos[index]["episode"]["r"], infos[index]["episode"]["l"]
             success = infos[index].get("is_success")
             if success is not None:
-                say[index], successes[index] = True, _truth(success, env.client_ids[index // env.n_envs_per_client])
+                say[index], successes[index] = True, truth(success, env.client_ids[index // env.n_envs_per_client])
         env.active[dones] = False
         if not env.active.any():
             break
@@ -112,13 +113,6 @@ def evaluate_federation(
             "gymnasium.wrappers.TimeLimit, or train without evaluation",
         )
     return Evaluation(returns.reshape(shape), lengths.reshape(shape), _successes(successes.reshape(shape), say.reshape(shape)))
-
-
-def _truth(success: Any, client: int) -> bool:
-    try:
-        return bool(success)
-    except ValueError:
-        raise ClientError([client], f"the is_success of its environment is neither true nor false: {success!r}") from None
 
 
 def _successes(successes: np.ndarray, say: np.ndarray) -> np.ndarray | None:
