@@ -203,3 +203,16 @@ def test_clients_of_ones_own_environments_and_a_part_of_a_family_are_watched_too
     own, part = ({value.tag for _, value in events(tmp_path / name)} for name in ("own", "part"))
     assert not [tag for tag in own if tag.startswith("pictures/")]
     assert part >= {"pictures/heterogeneity", "pictures/densities"}
+
+
+def test_many_clients_get_a_bounded_picture(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(pictures, "draw_density", lambda axes, density, title: drawn.append(title))
+    figures = []
+    monkeypatch.setattr(pictures, "_rgb", lambda figure: figures.append(figure))
+    for n_clients in (4, 400):
+        policies = Policies(np.zeros((n_clients, 2)), np.ones((n_clients, 2)))
+        drawn.clear()
+        pictures.bandit_densities(policies, range(n_clients), broadcast=policies)
+        assert drawn[-1] == "broadcast policy" and len(drawn) == min(n_clients, pictures.MAX_DENSITIES) + 1
+        assert figures[-1].get_suptitle() == ("" if n_clients == 4 else "the first 30 of 400 clients")

@@ -19,6 +19,8 @@ DPI = 90
 #: Matrices with at most so many columns get their numbers written into the cells.
 MAX_ANNOTATED = 10
 COLUMNS = 3
+#: Densities are drawn of the first so many clients: every one has axes of its own, which take long to draw.
+MAX_DENSITIES = 30
 LEGEND = "colour: policy\n+: its mean\ndashed: the client's\nprior, 2 deviations"
 
 
@@ -95,14 +97,16 @@ def bandit_densities(
 ) -> np.ndarray:
     """Bandit2D's policies as densities over actions, with the clients' personal priors and the global one where given.
 
+    Of more than :data:`MAX_DENSITIES` clients the first are drawn, and the title says so.
+
     :param policies: of the clients after local training
     :param priors: on :func:`~sb3_fedguide.benchmark.figures.bandit2d.grid`
     :param broadcast: what the server sent after it
     """
     from sb3_fedguide.benchmark.figures.bandit2d import grid
 
-    densities = policies.density(grid())
-    panels = [(f"client {client}", density) for client, density in zip(client_ids, densities, strict=True)]
+    densities = policies.density(grid())[:MAX_DENSITIES]
+    panels = [(f"client {client}", density) for client, density in zip(client_ids, densities, strict=False)]
     if priors is not None:
         panels.append(("global prior", priors.server))
     if broadcast is not None:
@@ -122,6 +126,8 @@ def bandit_densities(
         axes.axis("off")
     if priors is not None and len(blanks):
         blanks[-1].text(0.0, 0.5, LEGEND, va="center", fontsize=8)
+    if len(densities) < len(client_ids):
+        figure.suptitle(f"the first {len(densities)} of {len(client_ids)} clients", fontsize=9)
     return _rgb(figure)
 
 
