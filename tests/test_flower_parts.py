@@ -96,7 +96,7 @@ def test_the_server_takes_what_concerns_it_from_the_clients_settings(keys: Path)
     path = keys / "server.yml"
     path.write_text(yaml.safe_dump({**SERVER, "params": {"eta": 0.2, "learning_rate": 1e-3, "n_rounds": 7}}))
     server = ServerDeployment(path).server
-    assert (server.n_rounds, server.rollout_size, server.settings) == (7, 200, {"eta": 0.2})
+    assert (server.n_rounds, server.rollout_size, server.settings) == (7, 200, {"eta": 0.2, "normalize": False})
     for cls in (FederatedPPO, FederatedDDPG):
         assert hyperparameters(cls)["rollout_size"][1] == ROLLOUT_SIZE
 
