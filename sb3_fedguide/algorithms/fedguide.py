@@ -25,7 +25,6 @@ from sb3_fedguide.priors.adaptation import HeadAdaptation
 from sb3_fedguide.priors.base import Prior, score_cost
 from sb3_fedguide.priors.importance import importance_weights
 from sb3_fedguide.priors.mixture import mixture_log_prob, mixture_sample
-from sb3_fedguide.server.averaging import Aggregator
 from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW
 from sb3_fedguide.server.strategy import Payload
 
@@ -362,9 +361,8 @@ class FedGuideP(FedGuide):
 class FedGuideA(ParameterAveraging, FedGuide):
     """FedGuide-A: FedGuide whose actors (with ``log_std``) are averaged every few rounds; critics stay local.
 
-    ``average_every``, ``average_until``, ``aggregator``, ``trim_fraction``, ``server_step``, ``server_momentum``, ``mix`` and
-    ``screening`` are those of :class:`~sb3_fedguide.common.parameter_averaging.ParameterAveraging`, all other parameters those
-    of :class:`FedGuide`.
+    Parameters are those of :class:`~sb3_fedguide.common.parameter_averaging.ParameterAveraging`, with other defaults, and of
+    :class:`FedGuide`.
     """
 
     server_method = "fedguide-a"
@@ -373,20 +371,11 @@ class FedGuideA(ParameterAveraging, FedGuide):
         self,
         policy: PolicyLike,
         env: FederationLike | None,
+        average: Literal["all", "actor", "critic"] = "actor",
         average_every: int = 5,
-        average_until: int | None = None,
-        aggregator: Aggregator = "mean",
-        trim_fraction: float = 0.25,
-        server_step: float | Literal["exp"] = 1.0,
-        server_momentum: float = 0.0,
-        mix: float | Schedule = 1.0,
-        screening: float = 0.0,
         **fedguide: object,
     ) -> None:
-        self._init_averaging(
-            "actor", average_every, average_until, aggregator, trim_fraction, server_step, server_momentum, mix, screening
-        )
-        super().__init__(policy, env, **fedguide)  # type: ignore[arg-type]
+        super().__init__(policy, env, average=average, average_every=average_every, **fedguide)  # type: ignore[arg-type]
 
 
 def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal, Unpack
-
-from stable_baselines3.common.type_aliases import Schedule
+from typing import Literal
 
 from sb3_fedguide.algorithms.fedavg import FedAvg
-from sb3_fedguide.common.arguments import FederatedPPOArguments
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
-from sb3_fedguide.server.averaging import Aggregator
 
 
 class FedGuideR(FedAvg):
@@ -32,28 +28,8 @@ class FedGuideR(FedAvg):
         self,
         policy: PolicyLike,
         env: FederationLike | None,
-        average: Literal["all", "actor", "critic"] = "all",
-        average_every: int = 1,
-        average_until: int | None = None,
-        aggregator: Aggregator = "mean",
-        trim_fraction: float = 0.25,
         server_step: float | Literal["exp"] = 2.0,
-        server_momentum: float = 0.0,
-        mix: float | Schedule = 1.0,
         screening: float = 0.05,
-        **ppo: Unpack[FederatedPPOArguments],
+        **fedavg: object,
     ) -> None:
-        super().__init__(
-            policy,
-            env,
-            average=average,
-            average_every=average_every,
-            average_until=average_until,
-            aggregator=aggregator,
-            trim_fraction=trim_fraction,
-            server_step=server_step,
-            server_momentum=server_momentum,
-            mix=mix,
-            screening=screening,
-            **ppo,
-        )
+        super().__init__(policy, env, server_step=server_step, screening=screening, **fedavg)  # type: ignore[arg-type]

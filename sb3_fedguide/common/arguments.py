@@ -62,3 +62,7 @@ class FederatedDDPGArguments(FederationArguments, total=False):
     noise_theta: float
     noise_sigma: float
     noise_dt: float
+
+
+class LearnerArguments(FederatedPPOArguments, FederatedDDPGArguments, total=False):
+    """Those of either learner, for methods that stand on both; the constructors refuse the other's."""

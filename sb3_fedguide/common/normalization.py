@@ -103,9 +103,8 @@ class FederatedNormalizer:
 
     def begin_round(self, present: np.ndarray) -> None:
         """Forget the last round's moments of the clients ``present``, ``(n_clients,)`` bool: they are uploaded, or lost."""
-        for moments in (self.round_obs.mean, self.round_obs.count):
-            moments[present] = 0.0
-        self.round_obs.var[present] = 0.0
+        for array in (self.round_obs.mean, self.round_obs.var, self.round_obs.count):
+            array[present] = 0.0
 
     def round_moments(self, index: int) -> Payload:
         """What client ``index`` uploads of its round's observations; nothing where statistics are not shared."""

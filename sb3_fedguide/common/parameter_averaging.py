@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal, Unpack
 
 import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
 
-from sb3_fedguide.common.federation import Federation
+from sb3_fedguide.common.arguments import LearnerArguments
+from sb3_fedguide.common.federation import Federation, FederationLike
 from sb3_fedguide.common.screening import Screening, check_screening
 from sb3_fedguide.server.averaging import (
     Aggregator,
@@ -22,7 +23,7 @@ from sb3_fedguide.server.strategy import N_SAMPLES, Payload
 
 
 class ParameterAveraging(Federation):
-    """Mixin for methods that average policy parameters; optimiser state stays with its client.
+    """Mixin, before its learner, for methods that average policy parameters; optimiser state stays with its client.
 
     :param average: ``"all"``, only the ``"actor"`` (with ``log_std``), or only the ``"critic"``
     :param average_every: average after every so many rounds
@@ -38,12 +39,17 @@ class ParameterAveraging(Federation):
         ``until_0.5`` takes all for half of the run and nothing after it, so that everybody ends with a policy of its own
     :param screening: share of its environment steps that a client may spend on tests of what the server sends against its own
         policy, see :class:`~sb3_fedguide.common.screening.Screening`; with 0 it takes it untested
+    :raises ValueError: for values out of range
+
+    All other parameters are those of the learner, :class:`FederatedPPO` or :class:`FederatedDDPG`.
     """
 
     state_attributes: ClassVar[tuple[str, ...]] = ("screening_state",)
 
-    def _init_averaging(
+    def __init__(
         self,
+        policy: Any,
+        env: FederationLike | None,
         average: Literal["all", "actor", "critic"] = "all",
         average_every: int = 1,
         average_until: int | None = None,
@@ -53,11 +59,8 @@ class ParameterAveraging(Federation):
         server_momentum: float = 0.0,
         mix: float | Schedule = 1.0,
         screening: float = 0.0,
+        **learner: Unpack[LearnerArguments],
     ) -> None:
-        """Called by a subclass's constructor, before its base's.
-
-        :raises ValueError: for values out of range
-        """
         check_averaging(average, average_every)
         check_aggregator(aggregator, trim_fraction)
         check_server_step(server_step, server_momentum)
@@ -77,6 +80,7 @@ class ParameterAveraging(Federation):
         self.screening_state: dict[str, np.ndarray] = {}
         self._tests = Screening(self)
         self._shares: dict[int, float] = {}
+        super().__init__(policy, env, **learner)  # type: ignore[arg-type, misc]
 
     @property
     def averaged_prefixes(self) -> tuple[str, ...]:

@@ -51,9 +51,9 @@ def _experts(settings: Settings, n_clients: int, seed: int) -> Strategy:
     return OTMoE(n_experts, settings["eta"], settings["cost"], settings["cost_scaling"], seed_sequence(seed, Role.SERVER))
 
 
-def _experts_and_actors(settings: Settings, n_clients: int, seed: int) -> Strategy:
-    check_averaging("actor", settings["average_every"])
-    averaging = Averaging(PPO_ACTOR, **{name: settings[name] for name in _OF_AVERAGING})
+def _experts_and_parameters(settings: Settings, n_clients: int, seed: int) -> Strategy:
+    averaging = _averaging(Averaging, PPO_ACTOR, PPO_CRITIC)(settings, n_clients, seed)
+    assert averaging is not None
     return Composite([_experts(settings, n_clients, seed), averaging])
 
 
@@ -77,7 +77,7 @@ METHODS: dict[str, Method] = {
     "fedguide": Method(_experts, _EXPERTS),
     "fedguide-p": Method(_experts, _EXPERTS),
     "fedguide-r": Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), {**_AVERAGING, "server_step": 2.0}),
-    "fedguide-a": Method(_experts_and_actors, {**_EXPERTS, **_OF_AVERAGING, "average_every": 5}),
+    "fedguide-a": Method(_experts_and_parameters, {**_EXPERTS, **_AVERAGING, "average": "actor", "average_every": 5}),
 }
 
 
