@@ -105,11 +105,12 @@ class ParameterAveraging(Federation):
 
     def _policy_upload(self, index: int) -> Payload:
         """Copies of a client's averaged parameters under SB3's names, and the number of samples behind them."""
-        payload = self._parameters(index)
+        payload = self.averaged_parameters(index)
         payload[N_SAMPLES] = np.array(self.rollout_size, dtype=np.float32)
         return payload
 
-    def _parameters(self, index: int) -> Payload:
+    def averaged_parameters(self, index: int) -> Payload:
+        """Copies of the averaged parameters of the client at position ``index``, under SB3's names."""
         named = self.policy.named_parameters()
         return {
             name: parameter[index].detach().cpu().numpy().copy()
@@ -165,7 +166,7 @@ class ParameterAveraging(Federation):
         share = self._shares.get(index, 1.0)
         if share == 1 or not average:
             return average
-        own = self._parameters(index)
+        own = self.averaged_parameters(index)
         return {name: ((1 - share) * own[name] + share * array).astype(np.float32) for name, array in average.items()}
 
     def _excluded_save_params(self) -> list[str]:

@@ -113,7 +113,7 @@ class Screening:
         seed = int(stream(model.seed, Role.SCREENING, model.round).integers(2**31))
         results = []
         for policies in ({}, {index: candidates[index] for index in episodes}):
-            own = {index: model._parameters(index) for index in policies}
+            own = {index: model.averaged_parameters(index) for index in policies}
             for index, parameters in policies.items():
                 model.policy.load_client(index, parameters)
             tested = evaluate_federation(lambda obs: model.predict(obs, deterministic=True)[0], self._env, seed, active)
