@@ -272,7 +272,7 @@ FORMATS: dict[str, Callable[[ClientPolicy, Any], None]] = {
 
 def client_settings(model: Any) -> dict[str, Any]:
     """What a client's own model takes over of a federation's hyperparameters; it has one environment."""
-    settings = {name: getattr(model, name) for name in SETTINGS["DDPG" if isinstance(model, DDPG) else "PPO"]}
+    settings = {name: getattr(model, name) for name in SETTINGS[model.learner]}
     return {**settings, "n_steps": model.rollout_size} if "n_steps" in settings else settings
 
 

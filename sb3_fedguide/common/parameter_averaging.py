@@ -17,7 +17,6 @@ from sb3_fedguide.server.averaging import (
     averaging_is_due,
     check_aggregator,
     check_averaging,
-    check_server_step,
 )
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload
 
@@ -63,7 +62,6 @@ class ParameterAveraging(Federation):
     ) -> None:
         check_averaging(average, average_every)
         check_aggregator(aggregator, trim_fraction)
-        check_server_step(server_step, server_momentum)
         check_screening(screening, average)
         if not callable(mix) and not 0 <= mix <= 1:
             raise ValueError(f"mix={mix} must lie in [0, 1]: it is the share of what the server sends that a client takes")

@@ -136,8 +136,6 @@ def clearly_better(returns: np.ndarray, others: np.ndarray, margin: float) -> bo
 
 
 def check_screening(screening: float, average: str) -> None:
-    """:raises ValueError: for a share outside [0, 0.5], or where no policy is sent that could be tested"""
-    if not 0 <= screening <= 0.5:
-        raise ValueError(f"screening={screening} must lie in [0, 0.5]: it is the share of environment steps spent on tests")
+    """:raises ValueError: where no policy is sent that could be tested"""
     if screening > 0 and average == "critic":
         raise ValueError("screening tests policies, and average='critic' sends none; use 'all' or 'actor', or screening=0")
