@@ -13,6 +13,7 @@ import torch as th
 from fed_envs.faults import ClientError
 from sb3_fedguide import FedAvg, FedGuide, FedKL, FedRL, FedSVRPGM
 from sb3_fedguide.algorithms import algorithm
+from sb3_fedguide.cli.recorder import CostCallback
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.priors import GaussianPrior, active_experts, mixture_log_prob
 from sb3_fedguide.server.averaging import Averaging, combine, weighted_average
@@ -376,3 +377,11 @@ def test_honest_clients_stay_far_below_the_limit(name, fraction):
         warnings.filterwarnings("error", message=".*rejects")
         model.learn(4 * model.n_participants * 40)
     assert model.round == 4 and model.strategy.metrics["rejected"] == 0
+
+
+def test_a_run_counts_rejected_uploads_by_client(point_envs):
+    model, costs = FedAvg("MlpPolicy", point_envs(4), n_epochs=1, **SMALL), CostCallback()
+    lie(model, 2, np.nan)
+    with pytest.warns(UserWarning, match="rejects the upload of client 2"):
+        model.learn(3 * 4 * 40, costs)
+    assert costs.rejected == {2: 3}
