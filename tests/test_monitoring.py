@@ -16,6 +16,7 @@ from tensorboard.plugins.hparams import metadata
 
 import fed_envs
 from fed_envs import FederatedVecEnv
+from fed_envs.generation import generate_family
 from sb3_fedguide import FedAvg, FedGuide, FedGuideA, FedRL, Local
 from sb3_fedguide.benchmark.bandit2d import Policies
 from sb3_fedguide.cli.main import main
@@ -159,6 +160,13 @@ def test_the_transport_plan_shows_who_is_routed_where():
     rows = np.eye(4)[[1, 0, 2, 3]]
     assert not np.array_equal(picture, pictures.transport_plan(rows, range(4)))
     assert max(pictures.transport_plan(np.full((64, 64), 1 / 64), range(64)).shape) < 2000
+
+
+def test_pictures_of_many_clients_are_as_large_as_those_of_fifty():
+    plans = [pictures.transport_plan(np.full((n, 8), 1 / 8), range(n)) for n in (50, 400)]
+    assert plans[0].shape == plans[1].shape
+    crowds = [pictures.heterogeneity(generate_family("Reacher", n), range(n)) for n in (50, 400)]
+    assert crowds[0].shape == crowds[1].shape
 
 
 def test_parameters_that_differ_are_found():

@@ -152,6 +152,9 @@ class ExchangeCallback(RoundCallback):
         for client, reason in self.server.rejected.items():
             warnings.warn(f"round {model.round}: the server rejects the upload of client {client}: {reason}", stacklevel=1)
             model.record_client(client, "rejected", 1.0)
+        for client, reason in self.server.new_doubts.items():
+            told = f"round {model.round}: the upload of client {client} is used, but looks wrong: {reason}"
+            warnings.warn(told, stacklevel=1)
         self._remember_outdated()
         for key, value in self.server.figures.items():
             self.logger.record(key, value)

@@ -19,6 +19,8 @@ DPI = 90
 #: Matrices with at most so many columns get their numbers written into the cells.
 MAX_ANNOTATED = 10
 COLUMNS = 3
+#: At most so many rows of a matrix get room and a label of their own, and so many columns a label.
+MAX_ROWS, MAX_LABELS = 50, 16
 #: Densities are drawn of the first so many clients: every one has axes of its own, which take long to draw.
 MAX_DENSITIES = 30
 LEGEND = "colour: policy\n+: its mean\ndashed: the client's\nprior, 2 deviations"
@@ -31,10 +33,12 @@ def transport_plan(rows: np.ndarray, client_ids: Sequence[int]) -> np.ndarray:
     :return: RGB, ``(height, width, 3)`` uint8, like all pictures here
     """
     n_clients, n_experts = rows.shape
-    figure = Figure(figsize=(WIDTH, 1.2 + 0.27 * n_clients), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(WIDTH, 1.2 + 0.27 * min(n_clients, MAX_ROWS)), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     image = axes.imshow(rows, cmap="viridis", vmin=0.0, vmax=1.0, aspect="auto")
-    axes.set(xlabel="expert", ylabel="client", xticks=range(n_experts), yticks=range(n_clients), yticklabels=client_ids)
+    labelled = _spread(n_clients, MAX_ROWS)
+    axes.set(xlabel="expert", ylabel="client", xticks=_spread(n_experts, MAX_LABELS), yticks=labelled)
+    axes.set_yticklabels([str(client_ids[row]) for row in labelled])
     axes.set_title("Transport plan: clients' weights of the experts", fontsize=9, loc="left")
     axes.tick_params(labelsize=8)
     if n_experts <= MAX_ANNOTATED:
@@ -55,14 +59,17 @@ def heterogeneity(family: Family, client_ids: Sequence[int]) -> np.ndarray | Non
         return None
     standardised = (values - values.mean(axis=0)) / values.std(axis=0)
     words = _words(clients)
-    figure = Figure(figsize=(WIDTH, 1.0 + 0.27 * len(names) + (1.2 if any(words) else 0.0)), dpi=DPI, layout="constrained")
+    height = 1.0 + 0.27 * min(len(names), MAX_ROWS) + (1.2 if any(words) else 0.0)
+    figure = Figure(figsize=(WIDTH, height), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     limit = max(2.0, float(np.abs(standardised).max()))
     image = axes.imshow(standardised.T, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto")
     labels = [f"{client.client} {text}".strip() for client, text in zip(clients, words, strict=True)]
-    axes.set(xticks=range(len(clients)), yticks=range(len(names)))
-    axes.set_xticklabels(labels, rotation=90 if any(words) else 0, fontsize=7)
-    axes.set_yticklabels([name.replace("_", " ") for name in names], fontsize=7)
+    columns, rows = _spread(len(clients), MAX_LABELS), _spread(len(names), MAX_ROWS)
+    turned = any(words) or len(clients) > MAX_ANNOTATED
+    axes.set(xlabel="client", xticks=columns, yticks=rows)
+    axes.set_xticklabels([labels[column] for column in columns], rotation=90 if turned else 0, fontsize=7)
+    axes.set_yticklabels([names[row].replace("_", " ") for row in rows], fontsize=7)
     axes.set_title(f"{family.name}: clients' parameters\ncolours: deviations from the mean", fontsize=8, loc="left")
     if len(clients) <= MAX_ANNOTATED:
         texts = [[_short(value) for value in row] for row in values.T]
@@ -134,6 +141,11 @@ def bandit_densities(
 def _annotate(axes: Axes, texts: Sequence[Sequence[str]], colors: np.ndarray) -> None:
     for (row, column), color in np.ndenumerate(colors):
         axes.text(column, row, texts[row][column], ha="center", va="center", color=str(color), fontsize=6.5)
+
+
+def _spread(n: int, most: int) -> list[int]:
+    """Positions out of ``n`` with equal steps, at most ``most`` of them."""
+    return list(range(0, n, -(-n // most)))
 
 
 def _short(value: float) -> str:

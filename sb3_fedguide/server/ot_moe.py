@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from sb3_fedguide.server.strategy import Payload, Strategy
+from sb3_fedguide.server.validation import FEWEST_NORMS
 
 HEAD = "prior.head"
 COST_ROW = "prior.cost_row"
@@ -18,6 +19,10 @@ MIXTURE_ROW = "prior.mixture_row"
 # POT looks at the marginals in its first and every tenth iteration after it.
 _ITERATIONS, _MAX_RUNS = 11, 900
 _DAMPING = 0.01
+
+#: A head looks wrong whose agreement with the others' is lower than the clients' median by more than this. Honest heads were
+#: at most 0.35 below it; random and negated ones at least 0.5 from the first round on, and mostly before (docs/robustness.md).
+LEAST_AGREEMENT = 0.5
 
 for _backend in ("PYTORCH", "JAX", "CUPY", "TENSORFLOW"):  # importing POT with all its backends takes seconds
     os.environ.setdefault(f"POT_BACKEND_DISABLE_{_backend}", "1")
@@ -124,6 +129,38 @@ def head_costs(heads: np.ndarray, experts: np.ndarray) -> np.ndarray:
     return np.stack([((flat - expert.reshape(-1)) ** 2).sum(axis=1) for expert in experts], axis=1)
 
 
+def head_oddity(heads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cosine of each head and the heads' median, taken coordinate by coordinate, and its distance from that median.
+
+    :param heads: ``(n_clients, ...)``
+    :return: ``(n_clients,)`` in [-1, 1], and ``(n_clients,)``
+    """
+    flat = heads.reshape(len(heads), -1)
+    median = np.median(flat, axis=0).astype(np.float64)
+    agreement, distance = np.empty(len(flat)), np.empty(len(flat))
+    for i, head in enumerate(flat):  # not all differences at once, see head_costs
+        length = np.linalg.norm(head) * np.linalg.norm(median)
+        agreement[i] = head @ median / length if length > 0 else 0.0
+        distance[i] = np.linalg.norm(head - median)
+    return agreement, distance
+
+
+def head_shares(plan: np.ndarray) -> np.ndarray:
+    """What the other clients' mixtures hold of each client's head, on average: ``1 / n_clients`` where all share alike.
+
+    Client j's mixture weighs expert m with ``P_jm / sum_m P_jm``, and that expert weighs client i's head with
+    ``P_im / sum_i P_im`` (paper, Eq. expert-update and personalized-prior).
+
+    :param plan: ``(n_clients, n_experts)``
+    :return: ``(n_clients,)``
+    """
+    n = len(plan)
+    rows = plan / plan.sum(axis=1, keepdims=True)
+    columns = plan / np.maximum(plan.sum(axis=0), np.finfo(float).tiny)
+    given = rows @ columns.T  # of head i to client j at [j, i]
+    return (given.sum(axis=0) - np.diag(given)) / (n - 1)
+
+
 def scale_cost(cost: np.ndarray, scaling: Literal["max", "median"]) -> np.ndarray:
     """Costs over their maximum, or over the median of the positive ones; all-zero costs stay zero."""
     positive = cost[cost > 0]
@@ -215,6 +252,7 @@ class OTMoE(Strategy):
         self.plan, error, self._potentials = sinkhorn_plan(cost, self.eta, start=start)
         rows = self.plan / self.plan.sum(axis=1, keepdims=True)
         self.rows.update(zip(clients, rows.astype(np.float32), strict=True))
+        self._look_at_heads(clients, heads)
         if round > 0:  # the first plan routes to the seeded experts as they are
             self._update_experts(heads)
         self._measure(cost, rows, error)
@@ -248,6 +286,23 @@ class OTMoE(Strategy):
         updated = np.tensordot(weights, heads.astype(np.float64), axes=(0, 0)).astype(np.float32)
         served = load > 1e-12  # an expert that nobody is routed to stays as it is
         self.experts = np.where(served.reshape(-1, *([1] * (heads.ndim - 1))), updated, self.experts)
+
+    def _look_at_heads(self, clients: list[int], heads: np.ndarray) -> None:
+        """How odd each client's head is, and how much of it the others are given: what the check of norms does not see."""
+        assert self.plan is not None
+        if len(clients) < FEWEST_NORMS:
+            return
+        (agreement, distance), shares = head_oddity(heads), head_shares(self.plan)
+        measured = {"head_agreement": agreement, "head_distance": distance, "head_share": shares}
+        for name, values in measured.items():
+            self.client_metrics[name] = dict(zip(clients, values.tolist(), strict=True))
+        usual = float(np.median(agreement))
+        for client, own, share in zip(clients, agreement, shares, strict=True):
+            if own < usual - LEAST_AGREEMENT:
+                self.doubts[client] = (
+                    f"its prior head agrees with the others' to {own:.2f}, where {usual:.2f} is usual; {share:.1%} of the "
+                    f"others' priors comes from it, where an even share would be {1 / len(clients):.1%}"
+                )
 
     def _measure(self, cost: np.ndarray, rows: np.ndarray, error: float) -> None:
         assert self.plan is not None

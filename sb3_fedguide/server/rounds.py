@@ -24,6 +24,9 @@ class Rounds:
         #: bytes that all clients together have sent and received, and what of them was before the first round
         self.bytes_up = self.bytes_down = 0
         self.offline_bytes_up = self.offline_bytes_down = 0
+        #: clients whose uploads look wrong since the last exchange and did not before, and why
+        self.new_doubts: dict[int, str] = {}
+        self._doubted: set[int] = set()
         #: figures of the last exchange, by log key
         self.figures: dict[str, float] = {}
 
@@ -58,9 +61,13 @@ class Rounds:
         self.outdated -= {k for k in missed if k in broadcasts and broadcasts[k].keys() >= self.strategy.latest(k).keys()}
         if any(broadcasts.values()):  # what the others received is what the absent and the rejected have missed
             self.outdated |= {*absent, *self.strategy.rejected}
+        self.new_doubts = {client: why for client, why in self.strategy.doubts.items() if client not in self._doubted}
+        self._doubted |= self.new_doubts.keys()
         up, down = payload_bytes(uploads), payload_bytes(broadcasts)
         self.count(up, down, offline=round == 0)
         self.figures = {f"federated/{key}": value for key, value in self.strategy.metrics.items()}
+        for name, values in self.strategy.client_metrics.items():
+            self.figures |= {f"client_{client}/{name}": value for client, value in values.items()}
         self.figures["federated/bytes_up"] = up
         self.figures["federated/bytes_down"] = down
         self.figures["federated/bytes_total"] = self.bytes_up + self.bytes_down

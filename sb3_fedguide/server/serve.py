@@ -270,6 +270,8 @@ class Server:
             if broadcast:
                 self.outbox[client] = (self.n_broadcasts, round, broadcast)
         self._reject(self.rounds.rejected, "upload")
+        for client, reason in self.rounds.new_doubts.items():
+            logger.warning("round %d: the upload of client %d is used, but looks wrong: %s", round, client, reason)
 
     def _reject(self, reasons: Mapping[int, str], what: str) -> None:
         for client, reason in reasons.items():

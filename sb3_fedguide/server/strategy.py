@@ -25,6 +25,10 @@ class Strategy(ABC):
     def __init__(self) -> None:
         #: figures of the last exchange, logged under ``federated/``
         self.metrics: dict[str, float] = {}
+        #: the same of single clients, by name and client id, logged under ``client_<k>/``
+        self.client_metrics: dict[str, dict[int, float]] = {}
+        #: clients whose uploads the last exchange used although they look wrong, and why
+        self.doubts: dict[int, str] = {}
         #: how far norms of uploads may exceed the median, see :func:`check_uploads`; ``None`` for no checks at all
         self.upload_bound: float | None = UPLOAD_BOUND
         #: clients whose uploads the last exchange rejected, and why
@@ -60,7 +64,7 @@ class Strategy(ABC):
         if self.upload_bound is not None:
             self.rejected = check_uploads(uploads, self.sent, self.norm_groups, self.upload_bound)
         accepted = {client: payload for client, payload in uploads.items() if client not in self.rejected}
-        in_setup, self.metrics = self.needs_setup, {}
+        in_setup, self.metrics, self.client_metrics, self.doubts = self.needs_setup, {}, {}, {}
         broadcasts = self.aggregate(round, accepted) if accepted else {}
         if in_setup:
             if not accepted:
@@ -139,11 +143,13 @@ class Composite(Strategy):
 
     def aggregate(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:
         merged: dict[int, Payload] = {client: {} for client in uploads}
-        self.metrics = {}
+        self.metrics, self.client_metrics, self.doubts = {}, {}, {}
         for strategy in self.strategies:
             for client, payload in strategy.aggregate(round, uploads).items():
                 merged[client].update(payload)
             self.metrics.update(strategy.metrics)
+            self.client_metrics.update(strategy.client_metrics)
+            self.doubts.update(strategy.doubts)
         return merged
 
     def latest(self, client: int) -> Payload:
