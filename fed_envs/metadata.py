@@ -26,7 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationErr
 
 from fed_envs.clients import BACKBONES, CLIENT_MODELS, Client
 from fed_envs.files import atomic_file
-from fed_envs.registration import ENTRY_POINTS, FAMILIES, environment_id
+from fed_envs.registration import FAMILIES, entry_point_of, environment_id
 
 SCHEMA_VERSION: Literal[1] = 1
 
@@ -129,7 +129,7 @@ class Family(BaseModel):
         identity = {"family": self.name} if shipped else {"metadata": self.to_dict()}
         return EnvSpec(
             id=environment_id(self.name),
-            entry_point=ENTRY_POINTS[self.world],
+            entry_point=entry_point_of(self.world),
             max_episode_steps=self.max_episode_steps,
             kwargs={**identity, "client": int(client), **kwargs},
         )

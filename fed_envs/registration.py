@@ -33,6 +33,11 @@ def environment_id(family: str) -> str:
     return f"fed_envs/{family}-v0"
 
 
+def entry_point_of(world: str) -> str:
+    """What Gymnasium is to load for a kind of world: :func:`environment_class` says what is missing where that fails."""
+    return f"{__name__}:{world}"
+
+
 def environment_class(world: str) -> Any:
     """The environment class of a kind of world.
 
@@ -49,6 +54,16 @@ def environment_class(world: str) -> Any:
             f"MuJoCo cannot be loaded with MUJOCO_GL={asked} ({type(error).__name__}: {error}): install what it needs (Debian "
             "and Ubuntu: libosmesa6 for osmesa, libegl1 for egl), or unset MUJOCO_GL, since training renders nothing"
         ) from error
+
+
+def __getattr__(name: str) -> Any:
+    """A world's environment class under the world's name, for Gymnasium's entry points.
+
+    :raises ValueError: as in :func:`environment_class`
+    """
+    if name not in ENTRY_POINTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return environment_class(name)
 
 
 def register_families() -> None:
@@ -99,7 +114,7 @@ def _register(family: str, world: str, max_episode_steps: int) -> None:
 
     gymnasium.register(
         id=environment_id(family),
-        entry_point=ENTRY_POINTS[world],
+        entry_point=entry_point_of(world),
         max_episode_steps=max_episode_steps,
         kwargs={"family": family},
     )

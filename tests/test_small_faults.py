@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+import gymnasium
 import pytest
 
 import fed_envs
@@ -47,5 +48,8 @@ def test_a_way_of_rendering_that_is_not_installed_is_one_message(monkeypatch, ca
     monkeypatch.setattr(registration, "import_module", broken)
     with pytest.raises(ValueError, match=r"MUJOCO_GL=osmesa \(AttributeError: .*libosmesa6.*unset MUJOCO_GL"):
         registration.environment_class("locomotion")
+    for make in (lambda: fed_envs.load_family("Hopper").make(0), lambda: gymnasium.make("fed_envs/Hopper-v0", client=0)):
+        with pytest.raises(ValueError, match="MUJOCO_GL=osmesa"):
+            make()
     assert main(["train", "--env", "Hopper", "--rounds", "1"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
