@@ -34,14 +34,16 @@ class Deployment:
     :param algo: command-line name
     :param params: hyperparameters
     :param env: family, of which there are the first ``n_clients`` clients
+    :param host: by which clients know the server
+    :param variables: of every process's environment
     :param server: further lines of the server's configuration
     """
 
     def __init__(
         self, folder: Path, algo: str, n_rounds: int, params: Mapping[str, Any] = SMALL, env: str = "Bandit2D",
-        n_clients: int = 3, **server: Any,
+        n_clients: int = 3, host: str = "localhost", variables: Mapping[str, str] | None = None, **server: Any,
     ) -> None:  # fmt: skip
-        self.folder, self.n_clients = folder, n_clients
+        self.folder, self.n_clients, self._variables = folder, n_clients, dict(variables or {})
         self.common = {"algo": algo, "seed": 0, "n_rounds": n_rounds, "params": dict(params)}
         self.metadata = folder / f"{env}.json"
         family = json.loads(fed_envs.FAMILIES[env].read_text())
@@ -50,11 +52,11 @@ class Deployment:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = free.getsockname()[1]
-        self.run("certificates", "certificates", "--host", "localhost")
+        self.run("certificates", "certificates", "--host", host)
         for client in range(n_clients):
             self.run("key", "keys", f"client_{client}")
             self._write(
-                f"client_{client}", client=client, metadata=self.metadata.name, server=f"localhost:{self.port}",
+                f"client_{client}", client=client, metadata=self.metadata.name, server=f"{host}:{self.port}",
                 ca="certificates/ca.crt", key=f"keys/client_{client}", folder=f"client_{client}",
                 cache_dir=f"cache_{client}", eval_freq=0, packages=["flower_faults"],
             )  # fmt: skip
@@ -69,7 +71,7 @@ class Deployment:
 
     def _environment(self, name: str) -> dict[str, str]:
         own = {"FEDGUIDE_FAULTS": str(self.folder / f"{name}.faults"), "FEDGUIDE_MARK": self._mark, "OMP_NUM_THREADS": "1"}
-        return {**os.environ, **own, "PYTHONPATH": str(TESTS)}
+        return {**os.environ, **self._variables, **own, "PYTHONPATH": str(TESTS)}
 
     def run(self, *command: str) -> None:
         """``fedguide deploy`` to its end."""
