@@ -8,7 +8,6 @@ import http.server
 import json
 import os
 import socket
-import socketserver
 import ssl
 import threading
 from collections.abc import Iterator
@@ -19,8 +18,6 @@ import pytest
 import yaml
 
 from sb3_fedguide.cli.main import main as fedguide
-from tests.flower_deployment import Deployment
-from tests.test_flower import assert_same
 from tests.test_flower_parts import CLIENT
 
 pytestmark = pytest.mark.flower
@@ -221,77 +218,3 @@ def test_a_client_says_who_answers_instead_of_the_server(
     assert fedguide(["deploy", "client", str(path)]) == code
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
-
-
-class CompanyProxy(socketserver.ThreadingTCPServer):
-    """A proxy as companies have them: it knows where ``fed.example.org`` is, and lets ``CONNECT`` through to it alone."""
-
-    daemon_threads = allow_reuse_address = True
-
-    class Tunnel(socketserver.StreamRequestHandler):
-        server: CompanyProxy
-
-        def handle(self) -> None:
-            method, target, _ = self.rfile.readline().decode().split()
-            while self.rfile.readline().strip():
-                pass
-            self.server.asked.append(f"{method} {target}")
-            host, _, port = target.rpartition(":")
-            if method != "CONNECT" or host != "fed.example.org":
-                self.wfile.write(b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n")
-                return
-            try:
-                upstream = socket.create_connection(("127.0.0.1", int(port)))
-            except OSError:
-                self.wfile.write(b"HTTP/1.1 502 Bad Gateway\r\nContent-Length: 0\r\n\r\n")
-                return
-            self.wfile.write(b"HTTP/1.1 200 Connection established\r\n\r\n")
-            with upstream:
-                back = threading.Thread(target=self._pass, args=(upstream, self.connection), daemon=True)
-                back.start()
-                self._pass(self.connection, upstream)
-                back.join()
-
-        @staticmethod
-        def _pass(source: socket.socket, target: socket.socket) -> None:
-            try:
-                while data := source.recv(65536):
-                    target.sendall(data)
-                target.shutdown(socket.SHUT_WR)
-            except OSError:  # one side has gone
-                pass
-
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), self.Tunnel)
-        self.asked: list[str] = []
-
-    def __enter__(self) -> CompanyProxy:
-        threading.Thread(target=self.serve_forever, daemon=True).start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.shutdown()
-        self.server_close()
-
-
-@pytest.mark.flower_slow
-def test_a_deployment_goes_through_a_companys_proxy_and_its_own_processes_do_not(tmp_path: Path) -> None:
-    """Only the proxy knows the server's name, and it forbids everything else, the loopback device included."""
-    with CompanyProxy() as proxy:
-        address = f"http://127.0.0.1:{proxy.server_address[1]}"
-        variables = {name: address for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY")}
-        variables |= dict.fromkeys(("no_proxy", "NO_PROXY"), "")
-        with Deployment(
-            tmp_path,
-            "fedavg",
-            n_rounds=2,
-            n_clients=2,
-            host="fed.example.org",
-            variables=variables,
-            min_clients=2,
-            timeout=300,
-        ) as deployment:
-            deployment.start_all()
-            assert deployment.exit_codes() == [0, 0, 0]
-            assert set(proxy.asked) == {f"CONNECT fed.example.org:{deployment.port}"}
-            assert_same(deployment)
