@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,12 @@ from sb3_fedguide.benchmark.paper import PAPER_F
 #: CV is taken over so many rounds at the end of a run, all of which are evaluated.
 LAST_ROUNDS = 20
 
+#: A client is stuck whose return is below this share of the best that is known of it.
+STUCK = 0.6
+
+#: Resamples of the bootstrap interval of a difference.
+RESAMPLES = 10_000
+
 
 @dataclass(frozen=True)
 class Result:
@@ -29,6 +35,8 @@ class Result:
     :param final: client-average return of the deployed policies after the last round; where clients tested what they were
         sent, in the last evaluation within as many environment steps as the rounds have without tests
     :param worst_client: the lowest client's return there
+    :param client_returns: every client's return there
+    :param best_returns: the best return of every client in any evaluation that the file holds
     :param success: share of the episodes there that succeeded; ``None`` where the environments do not say
     :param broadcast: client-average return of the policy that the server sent last; ``None`` where it sends none
     :param curve: evaluated round to client-average return of the deployed policies
@@ -50,6 +58,8 @@ class Result:
     n_episodes: int
     final: float
     worst_client: float
+    client_returns: tuple[float, ...]
+    best_returns: tuple[float, ...]
     success: float | None
     broadcast: float | None
     curve: Mapping[int, float]
@@ -72,6 +82,11 @@ class Measures:
     :param worst_client: the lowest client's return, averaged over seeds
     :param speed_up: rounds of a run over the first evaluated round in which the curve is at the target; ``None`` without a
         target, or where it is never reached
+    :param area: mean of the curve from the first to the last evaluated round, by environment steps, averaged over seeds
+    :param difference: F less that of the baseline over the seeds that both have, and the 95 % bootstrap interval of the paired
+        differences, where there are two such seeds; ``None`` without a baseline
+    :param stuck: clients per run whose return is below :data:`STUCK` of the best known of them; ``None`` where that is not
+        known, or not positive
     :param curve: asked-for round to client-average return, averaged over seeds; without those that were not evaluated
     :param seconds_per_round: the fastest seed's median: other work on the machine only adds
     :param paper_F: of the paper
@@ -94,6 +109,10 @@ class Measures:
     seconds_per_round: float
     paper_F: float | None
     speed_up: float | None = None
+    area: float | None = None
+    difference: float | None = None
+    difference_interval: tuple[float, float] | None = None
+    stuck: float | None = None
 
 
 def result_folder(folder: Path, family: str, label: str) -> Path:
@@ -144,6 +163,8 @@ def _result(path: Path, content: dict[str, Any]) -> Result:
         n_episodes=int(deployed["n_episodes"]),
         final=float(np.mean(final) if final else deployed["average"]),
         worst_client=float(np.min(final) if final else deployed["worst_client"]),
+        client_returns=tuple(final or [float(value) for value in deployed.get("client_returns", ())]),
+        best_returns=_best_returns(deployed),
         success=None if rates is None else float(np.mean([rate for rate in rates if rate is not None])),
         broadcast=None if broadcast is None else float(broadcast["average"]),
         curve={int(round): float(value) for round, value in deployed["curve"]},
@@ -164,6 +185,11 @@ def _final_returns(content: Mapping[str, Any]) -> list[float]:
     budget = content["timesteps"] - tests
     within = [returns for _, steps, returns in content["deployed"]["client_curve"] if steps <= budget]
     return [float(value) for value in within[-1]] if within else []
+
+
+def _best_returns(deployed: Mapping[str, Any]) -> tuple[float, ...]:
+    evaluated = [returns for _, _, returns in deployed.get("client_curve", ())] or [deployed.get("client_returns", ())]
+    return tuple(float(value) for value in np.max(np.array(evaluated, dtype=float), axis=0))
 
 
 def _spent(content: Mapping[str, Any]) -> dict[int, float]:
@@ -220,13 +246,20 @@ def read_results(
     return found
 
 
-def measure(results: Sequence[Result], at_rounds: Sequence[int] = (), target: float | None = None) -> Measures:
+def measure(
+    results: Sequence[Result],
+    at_rounds: Sequence[int] = (),
+    baseline: Sequence[Result] | None = None,
+    best_known: np.ndarray | None = None,
+) -> Measures:
     """The measures of one method on one family.
 
     :param results: one per seed
     :param at_rounds: rounds of the curve to report as well
-    :param target: return that counts for the speed-up, such as F of another method
+    :param baseline: results of the method whose F counts for the speed-up, and from which differences are taken
+    :param best_known: the best return known of each client, ``(n_clients,)``
     """
+    paired = [] if baseline is None or baseline is results else paired_differences(results, baseline)
     final = np.array([result.final for result in results])
     success = [result.success for result in results if result.success is not None]
     broadcast = [result.broadcast for result in results if result.broadcast is not None]
@@ -254,7 +287,11 @@ def measure(results: Sequence[Result], at_rounds: Sequence[int] = (), target: fl
         offline_bytes_down=_known_mean([result.offline_bytes_down for result in results]),
         seconds_per_round=min(result.median_seconds for result in results),
         paper_F=PAPER_F.get(results[0].family, {}).get(results[0].method),
-        speed_up=None if target is None else speed_up(results, target),
+        speed_up=None if baseline is None else speed_up(results, float(np.mean([result.final for result in baseline]))),
+        area=float(np.mean([area(result) for result in results])),
+        difference=float(np.mean(paired)) if len(paired) else None,
+        difference_interval=mean_interval(np.array(paired)) if len(paired) > 1 else None,
+        stuck=None if best_known is None else stuck_clients(results, best_known),
     )
 
 
@@ -268,6 +305,40 @@ def speed_up(results: Sequence[Result], target: float) -> float | None:
         if np.mean([result.curve[round] for result in results]) >= target:
             return results[0].n_rounds / float(np.mean([result.spent[round] for result in results]))
     return None
+
+
+def area(result: Result) -> float:
+    """The mean of a run's curve over environment steps, from the first to the last evaluation, by the trapezoidal rule."""
+    rounds = sorted(result.curve)
+    values, spent = [result.curve[round] for round in rounds], [result.spent[round] for round in rounds]
+    return float(np.trapezoid(values, spent) / (spent[-1] - spent[0])) if len(rounds) > 1 else values[0]
+
+
+def paired_differences(results: Sequence[Result], baseline: Sequence[Result]) -> list[float]:
+    """F of each seed less the baseline's with the same seed."""
+    theirs = {result.seed: result.final for result in baseline}
+    return [result.final - theirs[result.seed] for result in results if result.seed in theirs]
+
+
+def mean_interval(values: np.ndarray, confidence: float = 0.95, seed: int = 0) -> tuple[float, float]:
+    """Percentile bootstrap interval of the mean of ``values``, ``(n,)``."""
+    rng = np.random.default_rng(seed)
+    means = values[rng.integers(0, len(values), (RESAMPLES, len(values)))].mean(axis=1)
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)
+
+
+def best_known(results: Iterable[Result]) -> np.ndarray | None:
+    """The best return of each client in any of the runs, ``(n_clients,)``; ``None`` where a file does not say."""
+    best = [result.best_returns for result in results]
+    return np.max(best, axis=0) if all(best) else None
+
+
+def stuck_clients(results: Sequence[Result], best: np.ndarray) -> float | None:
+    """Clients per run whose return is below :data:`STUCK` of the best known; ``None`` unless all of those are positive."""
+    if not (best > 0).all():
+        return None
+    return float(np.mean([(np.array(result.client_returns) < STUCK * best).sum() for result in results]))
 
 
 def _known_mean(values: Sequence[float | None]) -> float | None:

@@ -259,15 +259,16 @@ def make_tables(arguments: argparse.Namespace, families: Mapping[str, Family], a
     :param aggregated: whether several families are aggregated
     :raises ValueError: for a damaged result file
     """
-    from sb3_fedguide.benchmark.results import measure
+    from sb3_fedguide.benchmark.results import best_known, measure
     from sb3_fedguide.cli.benchmark_tables import Tables
 
     found = {name: results for name, results in _results(arguments, families).items() if results}
     rows = {}
     for name, results in found.items():
         baseline = results.get(arguments.baseline)
-        target = None if baseline is None or len(results) < 2 else measure(baseline).F
-        rows[f"{name}-{arguments.label}"] = [measure(runs, arguments.at_rounds, target) for runs in results.values()]
+        baseline = baseline if len(results) > 1 else None
+        best = best_known(run for runs in results.values() for run in runs)
+        rows[f"{name}-{arguments.label}"] = [measure(runs, arguments.at_rounds, baseline, best) for runs in results.values()]
     if len(found) < 2 or not aggregated:
         return Tables(rows, (), ())
     complete = [method for method in next(iter(found.values())) if all(method in results for results in found.values())]

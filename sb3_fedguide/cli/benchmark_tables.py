@@ -42,8 +42,10 @@ def rows_of(measures: Sequence[Measures]) -> list[Row]:
         "method": lambda row: row.method,
         "seeds": lambda row: str(len(row.seeds)),
         "F": lambda row: f"{row.F:.4g} ± {row.F_std:.3g}" if len(row.seeds) > 1 else f"{row.F:.4g}",
+        "less the baseline's": lambda row: _difference(row),
         "speed-up": lambda row: _number(row.speed_up, ".2f"),
         "worst client": lambda row: f"{row.worst_client:.4g}",
+        "stuck": lambda row: _number(row.stuck, ".2g"),
         "W": lambda row: f"{row.W:.4g}",
         "CV of the last 20 rounds": lambda row: _number(row.CV, ".3f"),
         **{f"round {round}": partial(_at_round, round) for round in rounds},
@@ -86,6 +88,13 @@ def _score(family: str, row: Aggregate) -> str:
 
 def _sizes(up: float | None, down: float | None) -> str | None:
     return None if up is None or down is None else f"{format_size(up)}, {format_size(down)}"
+
+
+def _difference(row: Measures) -> str | None:
+    if row.difference is None:
+        return None
+    interval = "" if row.difference_interval is None else " ({:.3g} to {:.3g})".format(*row.difference_interval)
+    return f"{row.difference:+.3g}{interval}"
 
 
 def _number(value: float | None, form: str) -> str | None:
