@@ -80,11 +80,7 @@ def test_what_is_said_beside_a_baseline_against_its_definition(tmp_path):
     curve = [[1, 0.0], [2, 3.0], [4, 5.0]]
     for algo, level in (("local", 5.0), ("fedavg", 6.0)):
         for seed in (0, 1, *((2,) if algo == "fedavg" else ())):
-            ends = {
-                "client_returns": curves[algo][-1][2],
-                "client_curve": curves[algo],
-                "curve": [[1, 0.0], [2, 3.0], [4, 5.0]],
-            }
+            ends = {"client_returns": clients[algo][-1][2], "client_curve": clients[algo], "curve": curve}
             write_result(tmp_path, algo=algo, seed=seed, average=level + seed * (1 if algo == "local" else 3), **ends)
     results = read_results(tmp_path, "Bandit2D", "tuned", ["local", "fedavg"])
     best = best_known(result for runs in results.values() for result in runs)
