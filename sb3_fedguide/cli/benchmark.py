@@ -228,7 +228,7 @@ def _run(arguments: argparse.Namespace, plan: Plan) -> int:
 
                 run_on_ray(plan.runs, arguments.processes, signals, done)
             else:
-                run_here(plan.runs, arguments.processes or 1, signals, done)
+                run_here(plan.runs, arguments.processes or 1, signals, done, _say)
         except KeyboardInterrupt:
             pass  # the second signal: the runs are ended, and the first one is in signals.received
     unfinished = sum(not run.result.is_file() for run in plan.runs)

@@ -23,6 +23,8 @@ PARAMETERS = "parameters.npz"
 DEPLOYED = "deployed.npz"
 CHECKPOINTS = "checkpoints"
 EVALUATIONS = "evaluations.csv"
+#: The stage of a run that is under way: see :mod:`sb3_fedguide.cli.status`.
+STATUS = "status.json"
 PACKAGES = (
     "sb3-fedguide", "stable-baselines3", "gymnasium", "gymnasium-robotics", "metaworld", "mujoco", "torch", "numpy", "scipy",
     "POT", "minari", "pydantic", "tensorboard",
