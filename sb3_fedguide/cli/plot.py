@@ -174,7 +174,7 @@ def _draw_all(
                 for runs in comparison.values() for group in runs.values() for run in group if run.result is None]  # fmt: skip
     for figure in arguments.figures or FIGURES:
         try:
-            drawn += _draw(figure, arguments, comparison, random)
+            drawn += _draw(figure, arguments, comparison, random, left_out)
         except ValueError as error:
             if figure in asked:
                 raise ValueError(f"{figure}: {error}") from None
@@ -184,7 +184,10 @@ def _draw_all(
     return drawn, left_out
 
 
-def _draw(figure: str, arguments: argparse.Namespace, comparison: Comparison, random: Callable[[str], float]) -> Drawn:
+def _draw(
+    figure: str, arguments: argparse.Namespace, comparison: Comparison, random: Callable[[str], float], notes: list[str]
+) -> Drawn:
+    """:param notes: takes what is to be said about the figure"""
     from sb3_fedguide.benchmark.figures import bars, clients, curves
 
     if figure == "curves":
@@ -205,7 +208,9 @@ def _draw(figure: str, arguments: argparse.Namespace, comparison: Comparison, ra
         raise ValueError("it needs finished runs on several families")
     from sb3_fedguide.benchmark.figures import aggregates  # PyTorch comes with it
 
-    aggregates.complete_methods(comparison, arguments.baseline)  # before random actions are measured
+    complete = aggregates.complete_methods(comparison, arguments.baseline)  # before random actions are measured
+    if partial := sorted({name for runs in comparison.values() for name in runs} - set(complete)):
+        notes.append(f"aggregate is without {', '.join(partial)}: some families have no finished run")
     return [("aggregate", aggregates.draw_aggregate(comparison, {family: random(family) for family in comparison},
                                                     arguments.baseline))]  # fmt: skip
 

@@ -40,7 +40,7 @@ def read_benchmark(arguments: argparse.Namespace, families: Mapping[str, Family]
         for method in _methods(method for results in found.values() for method in results[family]):
             having = [label for label in labels if any(method in results for results in found[label].values())]
             for variant, label in enumerate(having):
-                name = f"{method} ({label})" if len(labels) > 1 else method
+                name = f"{method}, {label}" if len(labels) > 1 else method
                 if group := found[label][family].get(method):
                     comparison[family][name] = [from_result(result, name, variant) for result in group]
         if not comparison[family]:

@@ -88,7 +88,7 @@ def draw_aggregate(comparison: Comparison, random: Mapping[str, float], baseline
     )
     right.axvline(0.5, color="black", linewidth=0.8, linestyle=":")
     right.set_xlim(-0.02, 1.02)
-    right.set_xlabel(f"probability of a run better than one of {reference}", fontsize=MEDIUM)
+    right.set_xlabel(f"probability that a run is better\nthan a run of {reference}", fontsize=MEDIUM)
     scale = "\n".join(f"{family}:\n {zero:.4g} to {one:.4g}" for family, (zero, one) in levels.items())
     title = f"95 % intervals: stratified bootstrap\nscore 0: random actions\nscore 1: mean of {reference}\n{scale}\n"
     legend(figure, [_handle(name, sum(map(len, scores[name])), looks[name]) for name in finals], title)
@@ -100,7 +100,7 @@ def _draw_profiles(axes: Axes, scores: Mapping[str, Sequence[np.ndarray]], looks
     span = max(float(every.max()), 1.0) - max(float(every.min()), LOWEST)
     levels = np.linspace(max(float(every.min()), LOWEST) - 0.03 * span, max(float(every.max()), 1.0) + 0.03 * span, N_LEVELS)
     for place, (name, groups) in enumerate(scores.items()):
-        keywords = {**looks[name].line_keywords(), "markersize": 4, "markevery": (5 * place, 45), "linewidth": 1.5}
+        keywords = {**looks[name].line_keywords(), "markersize": 4, "markevery": (0.03 * place, 0.3), "linewidth": 1.5}
         axes.plot(levels, performance_profile(groups, levels), **keywords)
         if any(len(group) > 1 for group in groups):
             axes.fill_between(levels, *profile_band(groups, levels), color=looks[name].color, alpha=0.12, linewidth=0)
@@ -122,6 +122,8 @@ def _draw_intervals(
             axes.barh(y, interval[1] - interval[0], left=interval[0], height=0.55, color=looks[name].color, alpha=0.4)
         axes.plot([value], [y], marker="|", markersize=13, markeredgewidth=2, color="black", linestyle="")
     axes.set_yticks(range(len(values)), list(values), fontsize=SMALL)
+    axes.use_sticky_edges = False
+    axes.margins(x=0.06)
     axes.set_ylim(len(values) - 0.4, -0.6)
     axes.grid(axis="x", alpha=0.3, linewidth=0.5)
 

@@ -24,7 +24,7 @@ _DOT: dict[str, Any] = {
     "markeredgecolor": "black",
     "markeredgewidth": 0.8,
 }
-_WORST: dict[str, Any] = {"marker": "|", "markersize": 11, "markeredgecolor": "black", "markeredgewidth": 1.6}
+_WORST: dict[str, Any] = {**_DOT, "markersize": 5.5, "markerfacecolor": "black", "markeredgecolor": "white"}
 
 
 def draw_bars(comparison: Comparison) -> Figure:
@@ -34,7 +34,7 @@ def draw_bars(comparison: Comparison) -> Figure:
     """
     found = require_finished(comparison)
     rows = max(len(results) for results in found.values())
-    figure, grid = panels(2 * len(found), (3.6, 1.0 + ROW * rows), columns=2, beside=1.6)
+    figure, grid = panels(2 * len(found), (3.6, 1.1 + ROW * max(rows, 3)), columns=2, beside=1.6)
     for place, (family, results) in enumerate(found.items()):
         left, right = grid[2 * place : 2 * place + 2]
         measures = {name: measure(group) for name, group in results.items()}
@@ -44,7 +44,7 @@ def draw_bars(comparison: Comparison) -> Figure:
         _bars(left, {name: row.F for name, row in measures.items()}, final, runs)
         for y, row in enumerate(measures.values()):
             if len(row.seeds) > 1:
-                left.plot(row.W, y, linestyle="", **_WORST)
+                left.plot(row.W, y, linestyle="", clip_on=False, zorder=3, **_WORST)
         _bars(right, {name: row.worst_client for name, row in measures.items()}, worst, runs)
         right.set_yticklabels([])
         left.set_title(family, fontsize=MEDIUM, loc="left")
@@ -74,7 +74,7 @@ def draw_speed_up(comparison: Comparison, baseline: str = "local") -> Figure:
     if not found:
         raise ValueError(f"it needs finished runs of the baseline, {baseline}, and of another method on the same family")
     rows = max(len(results) for results in found.values())
-    figure, grid = panels(len(found), (3.6, 1.0 + ROW * rows), columns=2, beside=1.6)
+    figure, grid = panels(len(found), (4.2, 1.1 + ROW * max(rows, 3)), columns=2, beside=1.9)
     for axes, (family, results) in zip(grid, found.items(), strict=True):
         target = measure(results[base(results, baseline)]).F
         together = {name: speed_up(group, target) for name, group in results.items()}
@@ -86,9 +86,12 @@ def draw_speed_up(comparison: Comparison, baseline: str = "local") -> Figure:
                 highest = max(dots[name], default=0.0)
                 axes.annotate("not reached", (highest, y), (6, 0), textcoords="offset points", va="center", fontsize=SMALL)
         axes.axvline(1.0, color="black", linewidth=0.8, linestyle=":")
-        axes.set_xlim(0.0, 1.05 * max(1.0, axes.get_xlim()[1]))
-        axes.set_title(f"{family}: F of {baseline} is {target:.4g}", fontsize=MEDIUM, loc="left")
-        axes.set_xlabel(f"speed-up: steps of a whole run over\nsteps until {baseline}'s F is reached", fontsize=MEDIUM)
+        right = max((max(dots[name], default=0.0) for name, value in together.items() if value is None), default=0.0)
+        axes.set_xlim(0.0, max(1.05, 1.05 * axes.get_xlim()[1], right + 0.5 * max(1.0, right)))  # with room for the words
+        axes.set_title(family, fontsize=MEDIUM, loc="left")
+        axes.set_xlabel(
+            f"speed-up: steps of a whole run over steps\nuntil F of {baseline}, {target:.4g}, is reached", fontsize=MEDIUM
+        )
     legend(figure, _marks([("one seed's curve\n(none: not reached)", _DOT)]), "bar: mean curve of all seeds")
     return figure
 
@@ -96,7 +99,7 @@ def draw_speed_up(comparison: Comparison, baseline: str = "local") -> Figure:
 def _bars(axes: Axes, means: Mapping[str, float], dots: Mapping[str, Sequence[float]], runs: Runs) -> None:
     for y, (name, mean) in enumerate(means.items()):
         axes.barh(y, mean, height=0.7, **style(runs[name][0].method, runs[name][0].variant).bar_keywords())
-        axes.plot(dots[name], np.full(len(dots[name]), y), linestyle="", **_DOT)
+        axes.plot(dots[name], np.full(len(dots[name]), y), linestyle="", clip_on=False, **_DOT)
     counts = {name: sum(run.result is not None for run in runs[name]) for name in means}
     axes.set_yticks(range(len(means)), [f"{name} ({seeds(count)})" for name, count in counts.items()], fontsize=SMALL)
     axes.set_ylim(len(means) - 0.4, -0.6)

@@ -90,7 +90,7 @@ def draw_clients(family: str, runs: Runs) -> Figure:
         raise ValueError(f"no run on {family} is finished")
     found = client_returns(results)
     n_methods, n_clients = found.mean.shape
-    figure, (axes,) = panels(1, (1.9 + 0.62 * n_clients, 1.1 + 0.42 * n_methods), beside=2.1)
+    figure, (axes,) = panels(1, (1.9 + 0.62 * n_clients, max(2.4, 1.1 + 0.42 * n_methods)), beside=2.1)
     image = axes.imshow(np.clip(found.share, 0.0, 1.0), cmap="cividis", vmin=0.0, vmax=1.0, aspect="auto")
     for (row, column), share in np.ndenumerate(found.share):
         text = _short(float(found.mean[row, column]))
@@ -112,11 +112,12 @@ def draw_clients(family: str, runs: Runs) -> Figure:
     axes.set_xlabel("client, and the best return that a run has reached for it", fontsize=MEDIUM)
     bar = figure.colorbar(image, ax=axes, ticks=[0, STUCK, 1], aspect=30)
     bar.ax.tick_params(labelsize=SMALL)
-    bar.set_label("share of the best return", fontsize=SMALL)
+    bar.set_label("share of the best return", fontsize=SMALL, labelpad=6)
     box: list[Artist] = [
         Rectangle((0, 0), 1, 1, fill=False, edgecolor=_STUCK_COLOR, linewidth=1.8, label="stuck: mean below\n60 % of the best")
     ]
-    legend(figure, box, "k of n: stuck with k\nof n seeds")
+    note = "\n\nwhere the best is negative:\nshort of it by 40 % of its size" if (found.best < 0).any() else ""
+    legend(figure, box, f"k of n: stuck with k\nof n seeds{note}")
     return figure
 
 

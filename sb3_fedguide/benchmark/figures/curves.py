@@ -30,8 +30,8 @@ _UNITS = {
 }
 #: Bootstrap samples of the seeds.
 RESAMPLES = 10_000
-#: A line has about so many markers.
-MARKERS = 6
+#: Of a line's markers, in lengths of the panel's diagonal: they lie as far apart where every round was evaluated.
+MARKER_SPACING = 0.2
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,14 @@ def draw_curves(comparison: Comparison, of: str = "average", x: str = "rounds", 
         family: {name: curve(group, [run.of(of) for run in group], x, band) for name, group in runs.items()}
         for family, runs in comparison.items()
     }
-    what = {"average": "mean over clients", "worst": "client with the lowest"}[of]
+    what = {"average": "mean over clients", "worst": "client with the lowest one"}[of]
     figure, grid = panels(len(curves), (3.6, 3.0), beside=1.9)
     unit = _unit(x, [line for lines in curves.values() for line in lines.values()])
     for axes, (family, lines) in zip(grid, curves.items(), strict=True):
         _draw(axes, lines, comparison[family], unit[0])
         axes.set_title(family, fontsize=MEDIUM, loc="left")
         axes.set_xlabel(unit[1], fontsize=MEDIUM)
-        axes.set_ylabel(f"return of an episode, {what}", fontsize=MEDIUM)
+        axes.set_ylabel(f"return of an episode,\n{what}", fontsize=MEDIUM)
         fit_scale(axes, [float(line.mean[-1]) for line in lines.values()])
     legend(figure, _handles(comparison), _title(comparison, band))
     return figure
@@ -129,14 +129,13 @@ def draw_client_curves(family: str, runs: Runs, x: str = "rounds", band: str = "
 def _draw(axes: Axes, lines: Mapping[str, Curve], runs: Runs, unit: float, width: float = 1.5) -> None:
     for place, (name, line) in enumerate(lines.items()):
         look = style(runs[name][0].method, runs[name][0].variant)
-        every = max(1, len(line.x) // MARKERS)
         axes.plot(
             line.x / unit,
             line.mean,
             **look.line_keywords(),
             linewidth=width,
             markersize=4,
-            markevery=(place % every, every),
+            markevery=(0.02 * place, MARKER_SPACING),
         )
         if line.band is not None:
             axes.fill_between(line.x / unit, *line.band, color=look.color, alpha=0.15, linewidth=0)
