@@ -90,7 +90,9 @@ def draw_aggregate(comparison: Comparison, random: Mapping[str, float], baseline
     right.set_xlim(-0.02, 1.02)
     right.set_xlabel(f"probability that a run is better\nthan a run of {reference}", fontsize=MEDIUM)
     scale = "\n".join(f"{family}:\n {zero:.4g} to {one:.4g}" for family, (zero, one) in levels.items())
-    title = f"95 % intervals: stratified bootstrap\nscore 0: random actions\nscore 1: mean of {reference}\n{scale}\n"
+    several = any(len(values) > 1 for of_families in finals.values() for values in of_families.values())
+    intervals = "95 % intervals: stratified bootstrap" if several else "one run per family: no intervals"
+    title = f"{intervals}\nscore 0: random actions\nscore 1: mean of {reference}\n{scale}\n"
     legend(figure, [_handle(name, sum(map(len, scores[name])), looks[name]) for name in finals], title)
     return figure
 

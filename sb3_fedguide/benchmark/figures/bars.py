@@ -84,10 +84,13 @@ def draw_speed_up(comparison: Comparison, baseline: str = "local") -> Figure:
         for y, (name, value) in enumerate(together.items()):
             if value is None:
                 highest = max(dots[name], default=0.0)
-                axes.annotate("not reached", (highest, y), (6, 0), textcoords="offset points", va="center", fontsize=SMALL)
+                words = axes.annotate(
+                    "not reached", (highest, y), (6, 0), textcoords="offset points", va="center", fontsize=SMALL
+                )
+                words.set_in_layout(False)  # the panel has room for them
         axes.axvline(1.0, color="black", linewidth=0.8, linestyle=":")
         right = max((max(dots[name], default=0.0) for name, value in together.items() if value is None), default=0.0)
-        axes.set_xlim(0.0, max(1.05, 1.05 * axes.get_xlim()[1], right + 0.5 * max(1.0, right)))  # with room for the words
+        axes.set_xlim(0.0, max(1.3, 1.05 * axes.get_xlim()[1], right + 0.5 * max(1.0, right)))  # with room for the words
         axes.set_title(family, fontsize=MEDIUM, loc="left")
         axes.set_xlabel(
             f"speed-up: steps of a whole run over steps\nuntil F of {baseline}, {target:.4g}, is reached", fontsize=MEDIUM

@@ -10,9 +10,10 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from sb3_fedguide.benchmark.figures.layout import MEDIUM, SMALL, fit_scale, legend, panels
-from sb3_fedguide.benchmark.figures.runs import Comparison, Run, Runs, seeds
+from sb3_fedguide.benchmark.figures.runs import Comparison, Run, Runs, names, seeds
 from sb3_fedguide.benchmark.figures.styles import style
 
 #: Band to what the legend says about it.
@@ -93,6 +94,7 @@ def draw_curves(comparison: Comparison, of: str = "average", x: str = "rounds", 
         _draw(axes, lines, comparison[family], unit[0])
         axes.set_title(family, fontsize=MEDIUM, loc="left")
         axes.set_xlabel(unit[1], fontsize=MEDIUM)
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=x == "rounds"))
         axes.set_ylabel(f"return of an episode,\n{what}", fontsize=MEDIUM)
         fit_scale(axes, [float(line.mean[-1]) for line in lines.values()])
     legend(figure, _handles(comparison), _title(comparison, band))
@@ -117,6 +119,7 @@ def draw_client_curves(family: str, runs: Runs, x: str = "rounds", band: str = "
     for axes, client, lines in zip(grid, clients, curves, strict=True):
         _draw(axes, lines, runs, unit[0], width=1.0)
         axes.set_title(f"client {client}", fontsize=SMALL, loc="left")
+        axes.xaxis.set_major_locator(MaxNLocator(4, integer=x == "rounds"))
         fit_scale(axes, [float(line.mean[-1]) for line in lines.values()])
         axes.set_ylabel("(symmetric log)" if axes.get_yscale() == "symlog" else "", fontsize=SMALL)
     figure.suptitle(f"{family}: clients", fontsize=MEDIUM)
@@ -154,7 +157,7 @@ def _unit(x: str, lines: Sequence[Curve]) -> tuple[float, str]:
 def _handles(comparison: Comparison) -> list[Artist]:
     """One entry per method, with its number of seeds, or the numbers of its families where they differ."""
     handles: list[Artist] = []
-    for name in dict.fromkeys(name for runs in comparison.values() for name in runs):
+    for name in names(comparison):
         groups = [runs[name] for runs in comparison.values() if name in runs]
         counts = sorted({len(group) for group in groups})
         number = seeds(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds"

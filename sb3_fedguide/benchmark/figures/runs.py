@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.benchmark.results import Result
 
 #: What a learning curve can be drawn over.
@@ -150,6 +151,13 @@ def require_finished(comparison: Comparison) -> dict[str, dict[str, list[Result]
 def base(results: Mapping[str, Sequence[Result]], baseline: str) -> str:
     """The name under which the baseline's results are; empty where there are none."""
     return next((name for name, group in results.items() if group[0].method == baseline), "")
+
+
+def names(comparison: Comparison) -> list[str]:
+    """Of the methods of all families, in the order in which their algorithms were registered."""
+    order = list(ALGORITHMS)
+    method = {name: group[0].method for runs in comparison.values() for name, group in runs.items()}
+    return sorted(method, key=lambda name: order.index(method[name]) if method[name] in order else len(order))
 
 
 def seeds(n: int) -> str:
