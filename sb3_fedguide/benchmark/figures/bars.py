@@ -102,7 +102,8 @@ def draw_speed_up(comparison: Comparison, baseline: str = "local") -> Figure:
 def _bars(axes: Axes, means: Mapping[str, float], dots: Mapping[str, Sequence[float]], runs: Runs) -> None:
     for y, (name, mean) in enumerate(means.items()):
         axes.barh(y, mean, height=0.7, **style(runs[name][0].method, runs[name][0].variant).bar_keywords())
-        axes.plot(dots[name], np.full(len(dots[name]), y), linestyle="", clip_on=False, **_DOT)
+        if len(dots[name]):  # an empty line that is not clipped would count as one at the figure's corner
+            axes.plot(dots[name], np.full(len(dots[name]), y), linestyle="", clip_on=False, **_DOT)
     counts = {name: sum(run.result is not None for run in runs[name]) for name in means}
     axes.set_yticks(range(len(means)), [f"{name} ({seeds(count)})" for name, count in counts.items()], fontsize=SMALL)
     axes.set_ylim(len(means) - 0.4, -0.6)

@@ -138,7 +138,7 @@ def _draw(axes: Axes, lines: Mapping[str, Curve], runs: Runs, unit: float, width
             **look.line_keywords(),
             linewidth=width,
             markersize=4,
-            markevery=(0.02 * place, MARKER_SPACING),
+            markevery=(0.02 * place, MARKER_SPACING) if np.isfinite(line.mean).any() else None,
         )
         if line.band is not None:
             axes.fill_between(line.x / unit, *line.band, color=look.color, alpha=0.15, linewidth=0)
