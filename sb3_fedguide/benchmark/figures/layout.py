@@ -77,4 +77,5 @@ def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     for path, suffix in zip(paths, FORMATS, strict=True):
         with rc_context({"pdf.fonttype": 42, "hatch.linewidth": 0.6}), atomic_file(path, "wb") as file:  # text stays text
             figure.savefig(file, format=suffix, dpi=DPI, metadata={"CreationDate": None} if suffix == "pdf" else None)
+        figure.set_layout_engine("none")  # panels stay where the first file has them
     return paths
