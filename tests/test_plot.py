@@ -37,8 +37,9 @@ CLIENTS = [0, 1, 2, 3]
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
-    """Small pictures are written sooner."""
+    """Small pictures, and no PDFs, whose fonts take long: both again where a test is about them."""
     monkeypatch.setattr(layout, "DPI", 60)
+    monkeypatch.setattr(layout, "FORMATS", ("png",))
 
 
 def result(folder: Path, algo: str = "local", seed: int = 0, level: float = 1.0, label: str = "tuned", **changes) -> Path:
@@ -98,8 +99,8 @@ def test_probability_of_improvement_is_the_mann_whitney_statistic():
     rng = np.random.default_rng(0)
     x, y = rng.integers(0, 6, 7).astype(float), rng.integers(0, 6, 5).astype(float)
     assert probability_of_improvement([x], [y]) == pytest.approx(mannwhitneyu(x, y).statistic / 35)
-    # Resamples of A: x is (1, 1), (1, 3), (3, 1) or (3, 3), y likewise; the lowest value 0.25, all of x being 1 and y 2, has
-    # probability 1/16, the highest, x all 3, has 1/4. B adds nothing.
+    # Resamples of A: x is (1, 1), (1, 3), (3, 1) or (3, 3), y likewise; the lowest value, 0 where all of x are 1 and of y 2,
+    # has probability 1/16, and the highest, 1 where all of x are 3, has 1/4. B halves them.
     assert improvement_interval(ours, theirs) == (0.0, 0.5)
     assert improvement_interval(ours, ours)[1] > 0.5 > improvement_interval(ours, ours)[0]
 
@@ -242,7 +243,8 @@ def is_picture(path: Path) -> bool:
     return path.read_bytes().startswith(start) and path.stat().st_size > 5000
 
 
-def test_the_command_writes_every_figure_that_the_data_allow(tmp_path, capfd):
+def test_the_command_writes_every_figure_that_the_data_allow(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(layout, "FORMATS", ("png", "pdf"))
     mine = two_families(tmp_path)
     out = tmp_path / "new" / "figures"
     flags = ["plot", "-f", str(tmp_path), "--envs", "Bandit2D", "--metadata", str(mine), "-o", str(out)]
@@ -309,7 +311,7 @@ def test_run_folders_are_drawn_finished_or_not(tmp_path, capfd):
         main(["plot", *map(str, folders), "-x", "steps", "--of", "clients", "-o", str(out), "--figures", "curves", "bars"])
         == 0
     )
-    assert is_picture(out / "curves-clients-steps-Bandit2D.png") and is_picture(out / "bars.pdf")
+    assert is_picture(out / "curves-clients-steps-Bandit2D.png") and is_picture(out / "bars.png")
     assert f"{folders[1]} is not finished, and is drawn in learning curves only" in capfd.readouterr().err
     assert main(["plot", *map(str, folders), "-x", "seconds", "-o", str(out)]) == 2
     assert f"curves: {folders[1]} does not say the seconds" in capfd.readouterr().err
