@@ -46,6 +46,12 @@ class Result:
     :param offline_bytes_up: once, before the first round; ``offline_bytes_down`` likewise
     :param median_seconds: of the median round
     :param config: hyperparameters; ``None`` where the file does not say
+    :param clients: their numbers; empty where the file does not say
+    :param client_finals: each client's return in the evaluation that ``final`` is of; empty where the file does not say
+    :param client_curve: evaluated round to each client's return; empty in files of earlier versions
+    :param steps_per_round: environment steps of all clients in a round without tests; ``None`` where the file does not say
+    :param round_seconds: of all rounds together: rollout, training and exchange; ``None`` where the file does not say
+    :param total_bytes: up and down, of all clients together, with what was sent before the first round
     """
 
     path: Path
@@ -70,6 +76,12 @@ class Result:
     offline_bytes_down: float | None
     median_seconds: float
     config: Mapping[str, Any] | None
+    clients: Sequence[int]
+    client_finals: Sequence[float]
+    client_curve: Mapping[int, Sequence[float]]
+    steps_per_round: float | None
+    round_seconds: float | None
+    total_bytes: float
 
 
 @dataclass(frozen=True)
@@ -129,7 +141,7 @@ def read_result(path: Path) -> Result:
     """:raises ValueError: if the file is damaged, or of a run that was not finished"""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        result = _result(path, content)
+        result = parse_result(path, content)
     except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{path} is not the result of a run ({reason}); delete it to repeat the run") from None
@@ -140,7 +152,12 @@ def read_result(path: Path) -> Result:
     return result
 
 
-def _result(path: Path, content: dict[str, Any]) -> Result:
+def parse_result(path: Path, content: Mapping[str, Any]) -> Result:
+    """The content of a result file, or the ``summary.json`` of a run's folder.
+
+    :raises ValueError: of a run that was not finished
+    :raises KeyError, TypeError, AttributeError: where something is missing or no number
+    """
     if content["finished"] is not True:
         raise ValueError(f"it ended after {content['rounds_done']} of {content['n_rounds']} rounds")
     deployed, rates = content["deployed"], content["deployed"].get("success_rates")
@@ -175,6 +192,14 @@ def _result(path: Path, content: dict[str, Any]) -> Result:
         offline_bytes_down=offline[1],
         median_seconds=float(content["seconds"]["median_round"]),
         config=None if config is None else dict(config),
+        clients=[int(client) for client in content.get("clients", ())],
+        client_finals=final or [float(value) for value in deployed.get("client_returns", ())],
+        client_curve={
+            int(round): [float(value) for value in returns] for round, _, returns in deployed.get("client_curve", ())
+        },
+        steps_per_round=_steps_per_round(content) if "timesteps" in content else None,
+        round_seconds=_round_seconds(content["seconds"]),
+        total_bytes=float(content["bytes_up"]) + float(content["bytes_down"]),
     )
 
 
@@ -196,8 +221,17 @@ def _spent(content: Mapping[str, Any]) -> dict[int, float]:
     deployed, tests = content["deployed"], content.get("test_timesteps", 0)
     if not tests:
         return {int(round): float(round) for round, _ in deployed["curve"]}
-    per_round = (content["timesteps"] - tests) / content["rounds_done"]
+    per_round = _steps_per_round(content)
     return {int(round): steps / per_round for round, steps, _ in deployed["client_curve"]}
+
+
+def _steps_per_round(content: Mapping[str, Any]) -> float:
+    return (content["timesteps"] - content.get("test_timesteps", 0)) / content["rounds_done"]
+
+
+def _round_seconds(seconds: Mapping[str, Any]) -> float | None:
+    parts = ("rollout", "train", "exchange")
+    return sum(float(seconds[part]) for part in parts) if all(part in seconds for part in parts) else None
 
 
 #: Methods whose clients train a prior's trunk together.
@@ -234,16 +268,20 @@ def read_results(
         wanted = [seed for seed in numbers if seeds is None or seed in seeds]
         if wanted:
             found[method] = [read_result(result_path(folder, family, label, method, seed)) for seed in wanted]
-    everything = [result for results in found.values() for result in results]
-    for result in everything:
-        first = everything[0]
+    check_comparable([result for results in found.values() for result in results])
+    return found
+
+
+def check_comparable(results: Sequence[Result]) -> None:
+    """:raises ValueError: for runs on one family with other clients, or another number of rounds or of episodes"""
+    for result in results:
+        first = results[0]
         for name, what in (("n_rounds", "rounds"), ("metadata_hash", "clients"), ("n_episodes", "episodes")):
             if getattr(result, name) != getattr(first, name):
                 raise ValueError(
                     f"{result.path} and {first.path} cannot stand in one table: their {what} differ ({getattr(result, name)} "
                     f"and {getattr(first, name)}); move one of them to the folder of another label"
                 )
-    return found
 
 
 def measure(

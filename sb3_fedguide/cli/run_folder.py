@@ -31,13 +31,13 @@ PACKAGES = (
 )  # fmt: skip
 
 
-def check_log_folder(folder: Path) -> None:
+def check_log_folder(folder: Path, what: str = "log folder", flag: str = "-f") -> None:
     """:raises ValueError: if no run could be written below ``folder``; nothing is created"""
     existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not existing.is_dir():
-        raise ValueError(f"the log folder {folder} cannot be made: {existing} is a file; give another one with -f")
+        raise ValueError(f"the {what} {folder} cannot be made: {existing} is a file; give another one with {flag}")
     if not os.access(existing, os.W_OK):
-        raise ValueError(f"the log folder {folder} cannot be written to ({existing}); give another one with -f")
+        raise ValueError(f"the {what} {folder} cannot be written to ({existing}); give another one with {flag}")
 
 
 def create_run_folder(log_folder: Path, algo: str, family: str) -> Path:
