@@ -35,8 +35,6 @@ class Result:
     :param final: client-average return of the deployed policies after the last round; where clients tested what they were
         sent, in the last evaluation within as many environment steps as the rounds have without tests
     :param worst_client: the lowest client's return there
-    :param client_returns: every client's return there
-    :param best_returns: the best return of every client in any evaluation that the file holds
     :param success: share of the episodes there that succeeded; ``None`` where the environments do not say
     :param broadcast: client-average return of the policy that the server sent last; ``None`` where it sends none
     :param curve: evaluated round to client-average return of the deployed policies
@@ -64,8 +62,6 @@ class Result:
     n_episodes: int
     final: float
     worst_client: float
-    client_returns: tuple[float, ...]
-    best_returns: tuple[float, ...]
     success: float | None
     broadcast: float | None
     curve: Mapping[int, float]
@@ -180,8 +176,6 @@ def parse_result(path: Path, content: Mapping[str, Any]) -> Result:
         n_episodes=int(deployed["n_episodes"]),
         final=float(np.mean(final) if final else deployed["average"]),
         worst_client=float(np.min(final) if final else deployed["worst_client"]),
-        client_returns=tuple(final or [float(value) for value in deployed.get("client_returns", ())]),
-        best_returns=_best_returns(deployed),
         success=None if rates is None else float(np.mean([rate for rate in rates if rate is not None])),
         broadcast=None if broadcast is None else float(broadcast["average"]),
         curve={int(round): float(value) for round, value in deployed["curve"]},
@@ -210,11 +204,6 @@ def _final_returns(content: Mapping[str, Any]) -> list[float]:
     budget = content["timesteps"] - tests
     within = [returns for _, steps, returns in content["deployed"]["client_curve"] if steps <= budget]
     return [float(value) for value in within[-1]] if within else []
-
-
-def _best_returns(deployed: Mapping[str, Any]) -> tuple[float, ...]:
-    evaluated = [returns for _, _, returns in deployed.get("client_curve", ())] or [deployed.get("client_returns", ())]
-    return tuple(float(value) for value in np.max(np.array(evaluated, dtype=float), axis=0))
 
 
 def _spent(content: Mapping[str, Any]) -> dict[int, float]:
@@ -368,15 +357,15 @@ def mean_interval(values: np.ndarray, confidence: float = 0.95, seed: int = 0) -
 
 def best_known(results: Iterable[Result]) -> np.ndarray | None:
     """The best return of each client in any of the runs, ``(n_clients,)``; ``None`` where a file does not say."""
-    best = [result.best_returns for result in results]
-    return np.max(best, axis=0) if all(best) else None
+    best = [np.max([result.client_finals, *result.client_curve.values()], axis=0) for result in results]
+    return np.max(best, axis=0) if all(len(returns) for returns in best) else None
 
 
 def stuck_clients(results: Sequence[Result], best: np.ndarray) -> float | None:
     """Clients per run whose return is below :data:`STUCK` of the best known; ``None`` unless all of those are positive."""
     if not (best > 0).all():
         return None
-    return float(np.mean([(np.array(result.client_returns) < STUCK * best).sum() for result in results]))
+    return float(np.mean([(np.array(result.client_finals) < STUCK * best).sum() for result in results]))
 
 
 def _known_mean(values: Sequence[float | None]) -> float | None:

@@ -12,10 +12,8 @@ from matplotlib.patches import Rectangle
 
 from sb3_fedguide.benchmark.figures.layout import MEDIUM, SMALL, legend, panels
 from sb3_fedguide.benchmark.figures.runs import Runs, finished, seeds
-from sb3_fedguide.benchmark.results import Result
+from sb3_fedguide.benchmark.results import STUCK, Result
 
-#: A client is stuck where it stays below this share of the best return that is known for it.
-STUCK = 0.6
 _STUCK_COLOR = "#D55E00"
 
 
