@@ -238,6 +238,11 @@ def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     return given
 
 
+def settings_entry(arguments: argparse.Namespace) -> str | None:
+    """The entry of a configuration file that ``--env`` asks for; ``None`` for that of the family."""
+    return None if arguments.env is None else arguments.env.removeprefix(ID_PREFIX).removesuffix(ID_SUFFIX)
+
+
 def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
     """Resolve the hyperparameters and construct the algorithm; nothing is written yet.
 
@@ -246,7 +251,7 @@ def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
     from sb3_fedguide.cli.config import resolve
 
     given = overrides(arguments)
-    entry = None if arguments.env is None else arguments.env.removeprefix(ID_PREFIX).removesuffix(ID_SUFFIX)
+    entry = settings_entry(arguments)
     config = resolve(arguments.algo, family, arguments.conf_file, entry, given, arguments.n_timesteps)
     if config.values["pretraining"]["dataset"] is not None:
         _check_dataset(config.values["pretraining"]["dataset"], family)
