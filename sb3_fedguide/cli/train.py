@@ -123,6 +123,7 @@ def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Call
     :raises ValueError: where it cannot go on
     """
     arguments = read_arguments(folder, given, prog)
+    check_tracker(arguments.track)
     import_packages(arguments.gym_packages)
     config, family = read_settings(folder, arguments.algo)
     config = with_length(config, family, given)
@@ -203,6 +204,7 @@ def check_before_imports(arguments: argparse.Namespace) -> None:
     check_names([arguments.algo], ALGORITHMS, "algorithm")
     if arguments.engine == "ray" and importlib.util.find_spec("ray") is None:
         raise ValueError("--engine ray needs Ray: pip install 'sb3-fedguide[ray]'")
+    check_tracker(arguments.track)
     check_log_folder(Path(arguments.log_folder))
     if arguments.tensorboard_log is not None:
         check_log_folder(Path(arguments.tensorboard_log))
@@ -213,6 +215,12 @@ def check_before_imports(arguments: argparse.Namespace) -> None:
         arguments.trained_agent = str(parameter_file(arguments.trained_agent))
     if arguments.delays is not None:
         arguments.delays = str(read_delays(arguments.delays))  # the run's own, should a file change
+
+
+def check_tracker(name: str | None) -> None:
+    """:raises ValueError: if the package that ``--track`` needs is missing"""
+    if name is not None and importlib.util.find_spec(name) is None:
+        raise ValueError(f"--track {name} needs the package {name}: pip install 'sb3-fedguide[{name}]'")
 
 
 def overrides(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -27,7 +27,6 @@ from sb3_fedguide.cli.train import (
     import_packages,
     overrides,
     prepare,
-    settings_entry,
 )
 from sb3_fedguide.cli.tune_arguments import N_TRIALS, PASSED_ON, SETTINGS, parse_tune
 
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
 
 #: Trials that fail before the first one works, after which no more are begun.
 MAX_FAILURES = 3
-SHOWN_TRIALS = 10
 #: Shares of a trial's rounds: what the median pruner leaves alone, and the halving pruner's first rung.
 MEDIAN_WARM_UP, FIRST_RUNG = 3, 8
 POLL = 0.1
@@ -110,9 +108,11 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide tune") -> int:
     except KeyboardInterrupt:
         print(f"{prog}: interrupted before the trials began", file=sys.stderr)
         return EXIT_INTERRUPTED
+    from sb3_fedguide.cli.tune_table import conclude
+
     try:
         code = _run(tuning, study)
-        _conclude(tuning, study)
+        conclude(tuning, study)
     except (ValueError, OSError) as error:
         print(f"{prog}: error: {one_message(error)}", file=sys.stderr)
         return EXIT_FAILED
@@ -188,7 +188,8 @@ def open_study(tuning: Tuning) -> optuna.Study:
         raise ValueError(f"{tuning.storage} cannot be used as a study's storage ({reason}); give another --storage") from None
     if before is not None and (changed := differences(json.loads(before), tuning.identity)):
         raise ValueError(
-            f"the study {tuning.name} in {tuning.storage} has other settings: {'; '.join(changed[:3])}; give another --study-name"
+            f"the study {tuning.name} in {tuning.storage} has other settings: {'; '.join(changed[:3])}; give another "
+            "--study-name"
         )
     return study
 
@@ -365,44 +366,6 @@ def _tell(study: optuna.Study, trial: ActiveTrial) -> str:
         _say(f"trial {number} ({shown}) failed: {trial.problem}")
         return "failed"
     return "interrupted"
-
-
-def _conclude(tuning: Tuning, study: optuna.Study) -> None:
-    """The table of the best trials, and their best settings as a configuration."""
-    import yaml
-    from optuna.trial import TrialState
-    from rich.console import Console
-    from rich.table import Table
-
-    from sb3_fedguide.cli.run_folder import write_text
-
-    trials = study.get_trials(deepcopy=False)
-    done = [trial for trial in trials if trial.state == TrialState.COMPLETE and "same_as" not in trial.user_attrs]
-    best = sorted(done, key=lambda trial: (-trial.values[0], trial.number))
-    if not best:
-        return
-    counts = Counter(trial.state.name.lower() for trial in trials)
-    told = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
-    title = f"{tuning.arguments.algo} on {tuning.family.name}: {len(trials)} trials ({told})"
-    table = Table(title=title, title_justify="left")
-    for name in ("trial", "F", *tuning.space.entries):
-        table.add_column(name, justify="right")
-    for trial in best[:SHOWN_TRIALS]:
-        values = [str(_plain(trial.params[name])) for name in tuning.space.entries]
-        table.add_row(str(trial.number), f"{trial.values[0]:.4g}", *values)
-    console = Console(width=None if Console().is_terminal else 160)
-    console.print(table)
-    settings = {name: _plain(best[0].params[name]) for name in tuning.space.entries}
-    entry = settings_entry(tuning.arguments) or tuning.family.name
-    text = yaml.safe_dump({entry: tuning.resolve(settings).values}, sort_keys=False, default_flow_style=None)
-    path = tuning.folder / "best.yml"
-    write_text(path, f"# {title}; trial {best[0].number}, F {best[0].values[0]:.6g}\n{text}")
-    console.print(f"best settings: -conf {path}", highlight=False, soft_wrap=True)
-
-
-def _plain(parameter: Any) -> Any:
-    """A value as Optuna has it, as plain data: entries of lists are JSON there."""
-    return json.loads(parameter) if isinstance(parameter, str) else parameter
 
 
 def _say(message: str) -> None:

@@ -27,8 +27,8 @@ def tune_parser(prog: str) -> OneLineParser:
     parser = OneLineParser(
         prog=prog,
         allow_abbrev=False,
-        description="Search for an algorithm's hyperparameters with Optuna. Every trial has the same environment steps; the same "
-        "command goes on until there are so many trials.",
+        description="Search for an algorithm's hyperparameters with Optuna. Every trial has the same environment steps; the "
+        "same command goes on until there are so many trials.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     flag = parser.add_argument
@@ -40,8 +40,8 @@ def tune_parser(prog: str) -> OneLineParser:
          f"{N_TRIALS}, and with --sampler grid every combination")  # fmt: skip
     flag("--seeds", nargs="+", type=int, default=[0], metavar="N", help="of a trial's runs, one after another; its value is "
          "their mean")  # fmt: skip
-    flag("--search", metavar="SPACE.yml", help="what is searched, NAME: [values] or NAME: {low, high, log}; by default a small "
-         "space of the algorithm (docs/tuning.md)")  # fmt: skip
+    flag("--search", metavar="SPACE.yml", help="what is searched, NAME: [values] or NAME: {low, high, log}; by default a "
+         "small space of the algorithm (docs/tuning.md)")  # fmt: skip
     flag("--sampler", default="tpe", choices=SAMPLERS, help="how settings are proposed; grid: every combination once")
     flag("--pruner", default="median", choices=PRUNERS, help="which trials are ended early")
     flag("--storage", metavar="FILE.db", help="SQLite file of the study; by default DIR/STUDY/study.db")

@@ -1,4 +1,4 @@
-"""What ``fedguide tune`` searches: a mapping of hyperparameters to their values, from a YAML file or the algorithm's default."""
+"""What ``fedguide tune`` searches: a mapping of hyperparameters to their values, from a YAML file or by default."""
 
 from __future__ import annotations
 
