@@ -33,13 +33,14 @@ def conclude(tuning: Tuning, study: optuna.Study) -> None:
     counts = Counter(trial.state.name.lower() for trial in trials)
     told = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
     title = f"{tuning.arguments.algo} on {tuning.family.name}: {len(trials)} trials ({told})"
-    table = Table(title=title, title_justify="left")
+    table = Table()
     for name in ("trial", "F", *tuning.space.entries):
         table.add_column(name, justify="right")
     for trial in best[:SHOWN_TRIALS]:
         values = [str(_plain(trial.params[name])) for name in tuning.space.entries]
         table.add_row(str(trial.number), f"{trial.values[0]:.4g}", *values)
     console = Console(width=None if Console().is_terminal else 160)
+    console.print(title, highlight=False, soft_wrap=True)  # as a table's title it would wrap at the table's width
     console.print(table)
     settings = {name: _plain(best[0].params[name]) for name in tuning.space.entries}
     entry = settings_entry(tuning.arguments) or tuning.family.name
