@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -62,14 +64,30 @@ summary = {
 FIXED = ["--algo", "fedprox", "--env", "Bandit2D", "--rounds", "6", "--eval-freq", "1", "-params", "bc_weight:0"]
 
 
+@pytest.fixture(scope="module")
+def empty_storage(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A storage without studies: to make its tables takes longer than everything else in a test."""
+    path = tmp_path_factory.mktemp("storage") / "empty.db"
+    optuna.storages.RDBStorage(f"sqlite:///{path}")
+    return path
+
+
 @pytest.fixture
-def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+def quick(tmp_path: Path, empty_storage: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
     """The command with the training command replaced, in ``tmp_path``, on a space of four values of ``mu``."""
     script = tmp_path.parent / f"{tmp_path.name}-training.py"
     script.write_text(f"N = {N_CLIENTS}\n{TRAINING}")
     monkeypatch.setattr(benchmark_runs, "TRAIN", (sys.executable, str(script)))
     monkeypatch.setattr(tune, "POLL", 0.01)
     monkeypatch.chdir(tmp_path)
+
+    class CopiedStorage(optuna.storages.RDBStorage):
+        def __init__(self, url: str, **arguments: Any) -> None:
+            if not (path := Path(url.removeprefix("sqlite:///"))).exists():
+                shutil.copy(empty_storage, path)
+            super().__init__(url, **arguments)
+
+    monkeypatch.setattr(optuna.storages, "RDBStorage", CopiedStorage)
     Path("space.yml").write_text("mu: [0.1, 0.2, 0.3, 0.4]\n")
 
     def run(*flags: str, behaviour: str = "") -> int:
