@@ -11,7 +11,21 @@ import pytest
 import sb3_fedguide
 
 ROOT = Path(__file__).resolve().parent.parent
-HEAVY = {"torch", "mujoco", "stable_baselines3", "gymnasium", "numpy", "scipy", "ot", "matplotlib", "minari"}
+HEAVY = {
+    "torch",
+    "optuna",
+    "sqlalchemy",
+    "wandb",
+    "trackio",
+    "mujoco",
+    "stable_baselines3",
+    "gymnasium",
+    "numpy",
+    "scipy",
+    "ot",
+    "matplotlib",
+    "minari",
+}
 
 
 def imported_by(*command: str) -> set[str]:
@@ -23,7 +37,9 @@ def imported_by(*command: str) -> set[str]:
     return {line.rpartition("|")[2].strip().partition(".")[0] for line in lines}
 
 
-@pytest.mark.parametrize("command", [("-c", "import sb3_fedguide"), ("train.py", "--help")], ids=" ".join)
+@pytest.mark.parametrize(
+    "command", [("-c", "import sb3_fedguide"), ("train.py", "--help"), ("-m", "sb3_fedguide", "tune", "--help")], ids=" ".join
+)
 def test_package_and_help_load_nothing_heavy(command: tuple[str, ...]) -> None:
     names = imported_by(*command)
     assert "sb3_fedguide" in names

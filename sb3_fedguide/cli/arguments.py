@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.engines import ENGINES
+
+#: Libraries that ``--track`` takes; each is the package of that name and an extra of this one.
+TRACKERS = ("trackio", "wandb")
+TRACK_PROJECT = "sb3-fedguide"
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -61,6 +66,8 @@ def train_parser(prog: str) -> OneLineParser:
     flag("-f", "--log-folder", default="logs", metavar="DIR", help="runs are written to DIR/ALGO/FAMILY_<number>")
     flag("-tb", "--tensorboard-log", metavar="DIR", help="TensorBoard events to DIR/FAMILY/ALGO_<number>; by default to tb "
          "in the run's folder")  # fmt: skip
+    flag("--track", choices=TRACKERS, help="log to trackio or Weights & Biases as well, with TensorBoard's keys")
+    flag("--track-project", metavar="NAME", help=f"project there; by default {TRACK_PROJECT}")
     flag("--cache-dir", metavar="DIR", help="where results of the offline stage are kept; by default $FEDGUIDE_CACHE or "
          "~/.cache/fedguide")  # fmt: skip
     flag("--eval-freq", type=int, default=5, metavar="ROUNDS", help="rounds between evaluations; the last twenty are all "
@@ -120,6 +127,10 @@ def _problems(arguments: Any) -> list[str]:
         found.append(f"--engine {arguments.engine} trains on CPUs; leave out --device {arguments.device}, or the engine")
     if arguments.ray_address is not None and arguments.engine != "ray":
         found.append("--ray-address is for --engine ray")
+    if arguments.track_project is not None and arguments.track is None and arguments.resume is None:
+        found.append("--track-project is for --track trackio or --track wandb")
+    if arguments.track_project is not None and not re.fullmatch(r"[\w.-]+", arguments.track_project):
+        found.append(f"--track-project {arguments.track_project!r} is no name: letters, digits and . _ - only")
     if arguments.picture_freq < 0:
         found.append(f"--picture-freq must not be negative, not {arguments.picture_freq}; 0 draws no pictures")
     if arguments.seed >= 2**31:

@@ -15,6 +15,7 @@ USAGE = """usage: fedguide COMMAND ...
   export     clients' policies for use elsewhere: Stable-Baselines3, TorchScript, torch.export, ONNX
   benchmark  methods on families with seeds, as runs that can be interrupted, and tables of their results
   plot       figures of a benchmark's results or of runs: learning curves, bars, clients, aggregates, speed-up
+  tune       search for an algorithm's hyperparameters with Optuna
   deploy     a federation over a network: certificates, keys, server and clients
   dataset    a Minari dataset for the offline stage from CSV or NPZ logs
   demo       FedAvg beside FedGuide on Bandit2D, with a picture
@@ -40,6 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "export": _export,
         "benchmark": _benchmark,
         "plot": _plot,
+        "tune": _tune,
         "deploy": _deploy,
         "dataset": _dataset,
         "demo": _demo,
@@ -77,6 +79,12 @@ def _benchmark(argv: Sequence[str]) -> int:
 
 def _plot(argv: Sequence[str]) -> int:
     from sb3_fedguide.cli.plot import main
+
+    return main(argv)
+
+
+def _tune(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.tune import main
 
     return main(argv)
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 #: Flags that change nothing in what a run computes, so that they may differ from the run's own.
 FREE = ("verbose", "progress", "save_freq", "picture_freq", "num_threads", "cache_dir", "gym_packages", "resume", "engine",
-        "num_actors", "ray_address")  # fmt: skip
+        "num_actors", "ray_address", "track", "track_project")  # fmt: skip
 
 PATHS = ("log_folder", "tensorboard_log", "metadata", "client_kwargs")
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from fed_envs import Family
     from sb3_fedguide.cli.config import Config
+    from sb3_fedguide.cli.tracking import TrackerOutputFormat
     from sb3_fedguide.common.callbacks import RoundCallback
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
@@ -94,6 +95,8 @@ class Run:
                 (folder / DEPLOYED).unlink(missing_ok=True)  # of an earlier part of this run
         summary = self._summary()
         write_json(folder / "summary.json", summary)
+        if self._tracker is not None:
+            self._tracker.finish(summary)
         if arguments.verbose:
             print_summary(summary, str(folder))
         return exit_code
@@ -138,9 +141,24 @@ class Run:
         if self.folder is not None:
             forget_later_events(events_output, self.model.environment_steps)
         outputs: list[KVWriter] = [events_output]
+        self._tracker = self._make_tracker(folder)
+        if self._tracker is not None:
+            outputs.append(self._tracker)
         if loud:
             outputs.append(HumanOutputFormat(sys.stdout))
         self.model.set_logger(Logger(str(events), outputs))
+
+    def _make_tracker(self, folder: Path) -> TrackerOutputFormat | None:
+        arguments = self.arguments
+        if arguments.track is None:
+            return None
+        from sb3_fedguide.cli.arguments import TRACK_PROJECT
+        from sb3_fedguide.cli.tracking import TrackerOutputFormat
+
+        shown = {"algo": arguments.algo, "family": self.family.name, "seed": self.model.seed, **self.config.values}
+        return TrackerOutputFormat(
+            arguments.track, arguments.track_project or TRACK_PROJECT, folder, shown, self.folder is not None
+        )
 
     def _train(self, folder: Path, signals: StopSignals) -> None:
         from sb3_fedguide.cli.recorder import CostCallback, DeployedCallback, RunEvalCallback, StopCallback

@@ -74,9 +74,10 @@ def parameter_file(trained: str) -> Path:
 
 
 @contextmanager
-def exclusive(folder: Path) -> Iterator[None]:
+def exclusive(folder: Path, wait: bool = False) -> Iterator[None]:
     """Nobody else writes to this run's folder meanwhile; the system takes the lock back from a process that dies.
 
+    :param wait: until a process that does is ready
     :raises ValueError: if a process does
     """
     try:
@@ -87,7 +88,7 @@ def exclusive(folder: Path) -> Iterator[None]:
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
             raise ValueError(f"the run in {folder} is still going on in another process") from None
         yield

@@ -123,6 +123,7 @@ def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Call
     :raises ValueError: where it cannot go on
     """
     arguments = read_arguments(folder, given, prog)
+    check_tracker(arguments.track)
     import_packages(arguments.gym_packages)
     config, family = read_settings(folder, arguments.algo)
     config = with_length(config, family, given)
@@ -203,6 +204,7 @@ def check_before_imports(arguments: argparse.Namespace) -> None:
     check_names([arguments.algo], ALGORITHMS, "algorithm")
     if arguments.engine == "ray" and importlib.util.find_spec("ray") is None:
         raise ValueError("--engine ray needs Ray: pip install 'sb3-fedguide[ray]'")
+    check_tracker(arguments.track)
     check_log_folder(Path(arguments.log_folder))
     if arguments.tensorboard_log is not None:
         check_log_folder(Path(arguments.tensorboard_log))
@@ -213,6 +215,12 @@ def check_before_imports(arguments: argparse.Namespace) -> None:
         arguments.trained_agent = str(parameter_file(arguments.trained_agent))
     if arguments.delays is not None:
         arguments.delays = str(read_delays(arguments.delays))  # the run's own, should a file change
+
+
+def check_tracker(name: str | None) -> None:
+    """:raises ValueError: if the package that ``--track`` needs is missing"""
+    if name is not None and importlib.util.find_spec(name) is None:
+        raise ValueError(f"--track {name} needs the package {name}: pip install 'sb3-fedguide[{name}]'")
 
 
 def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -238,6 +246,11 @@ def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     return given
 
 
+def settings_entry(arguments: argparse.Namespace) -> str | None:
+    """The entry of a configuration file that ``--env`` asks for; ``None`` for that of the family."""
+    return None if arguments.env is None else arguments.env.removeprefix(ID_PREFIX).removesuffix(ID_SUFFIX)
+
+
 def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
     """Resolve the hyperparameters and construct the algorithm; nothing is written yet.
 
@@ -246,7 +259,7 @@ def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
     from sb3_fedguide.cli.config import resolve
 
     given = overrides(arguments)
-    entry = None if arguments.env is None else arguments.env.removeprefix(ID_PREFIX).removesuffix(ID_SUFFIX)
+    entry = settings_entry(arguments)
     config = resolve(arguments.algo, family, arguments.conf_file, entry, given, arguments.n_timesteps)
     if config.values["pretraining"]["dataset"] is not None:
         _check_dataset(config.values["pretraining"]["dataset"], family)
