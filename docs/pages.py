@@ -32,8 +32,6 @@ PLACEHOLDER = re.compile(r"<!-- (?P<kind>parameters|results) of (?P<name>\S+) --
 
 PARAMETER = re.compile(r":param (?P<name>\w+): (?P<text>.*)")
 
-PICTURE_WIDTH = 700
-
 
 def fill_placeholders(text: str, up: str) -> str:
     """A page with its placeholders replaced.
@@ -175,7 +173,7 @@ def family_page(family: Family) -> str:
 {client_table(family)}
 
 [environments.md](../environments.md#{WORLDS[family.world]}) says what each parameter acts on.
-{_picture(family)}
+
 ## Example
 
 ```python
@@ -238,34 +236,14 @@ def _cell(value: object) -> str:
     return str(value).replace("_", " ")
 
 
-def _picture(family: Family) -> str:
-    if (DOCS / "families" / f"{family.name}.png").exists():
-        return f"\n![{family.name}: clients' parameters]({family.name}.png)\n"
-    return ""
-
-
 def _own_settings(family: Family) -> str:
     names = [name for name in ALGORITHMS if resolve(name, family).entry == family.name]
     return ", ".join(f"`{name}`" for name in names) if names else "none; every method takes its `default`"
 
 
-def write_pictures(folder: Path) -> None:
-    """How the clients of each family differ, drawn once."""
-    from PIL import Image
-
-    from sb3_fedguide.monitoring.pictures import heterogeneity
-
-    for name in FAMILIES:
-        family, file = load_family(name), folder / f"{name}.png"
-        pixels = None if file.exists() else heterogeneity(family, range(family.n_clients))
-        if pixels is not None:
-            Image.fromarray(pixels).save(file)
-
-
 def write_pages(folder: Path = DOCS / "families") -> None:
     """Write the pages whose content has changed."""
     folder.mkdir(exist_ok=True)
-    write_pictures(folder)
     for name, content in family_pages().items():
         file = folder / name
         if not file.exists() or file.read_text() != content:
