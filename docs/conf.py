@@ -5,7 +5,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from docutils import nodes
+from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+from sphinx.util.nodes import make_refnode
 
 sys.path.insert(0, str(Path(__file__).parent))
 import pages
@@ -21,7 +25,6 @@ source_suffix = {".md": "markdown"}
 exclude_patterns = ["examples"]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4
-suppress_warnings = ["myst.header"]  # a page included from the repository's root starts where its own title ends
 
 html_theme = "furo"
 html_title = "sb3-fedguide"
@@ -39,11 +42,30 @@ python_maximum_signature_line_length = 88
 python_use_unqualified_type_names = True
 
 
-def fill_placeholders(app: Sphinx, page: str, source: list[str]) -> None:
-    """Tables of parameters and links to results, in place of comments."""
+def complete_page(app: Sphinx, page: str, source: list[str]) -> None:
+    """Tables of parameters and links to results in place of comments; the repository's own pages in place of links to them."""
+    if page in pages.ROOT_PAGES:
+        app.env.note_dependency(str(pages.ROOT / f"{page.upper()}.md"))
+        source[0] = pages.root_page(page)
     source[0] = pages.fill_placeholders(source[0], "../" * page.count("/"))
+
+
+def resolve_short_name(
+    app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nodes.TextElement
+) -> nodes.Node | None:
+    """Docstrings name what their own module imports; here it is found by its last part, where only one object has it."""
+    if node.get("refdomain") != "py":
+        return None
+    objects = env.domains.python_domain.objects
+    name = node["reftarget"].rpartition(".")[2]
+    found = {entry for full, entry in objects.items() if full.rpartition(".")[2] == name and entry.objtype != "module"}
+    if len(found) != 1:
+        return None
+    (entry,) = found
+    return make_refnode(app.builder, node["refdoc"], entry.docname, entry.node_id, content, name)
 
 
 def setup(app: Sphinx) -> None:
     pages.write_pages()
-    app.connect("source-read", fill_placeholders)
+    app.connect("source-read", complete_page)
+    app.connect("missing-reference", resolve_short_name)

@@ -16,7 +16,11 @@ from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.config import resolve
 
 DOCS = Path(__file__).parent
+ROOT = DOCS.parent
 RESULTS = DOCS / "results.md"
+
+#: Pages that the repository has at its root, where code hosts look for them, in capitals.
+ROOT_PAGES = ("changelog", "contributing", "security")
 
 #: Where environments.md explains the fields of a world's clients.
 WORLDS = {
@@ -46,6 +50,19 @@ def fill_placeholders(text: str, up: str) -> str:
         return parameter_tables(match["name"]) if match["kind"] == "parameters" else result_links(match["name"], up)
 
     return PLACEHOLDER.sub(replacement, text)
+
+
+def root_page(name: str) -> str:
+    """A page of the repository's root, with its links as they are from ``docs``."""
+
+    def moved(match: re.Match[str]) -> str:
+        target = match[1]
+        if target.startswith("docs/"):
+            return f"]({target.removeprefix('docs/')}"
+        stem = target.partition(".md")[0].lower()
+        return f"]({stem}.md" if stem in ROOT_PAGES else f"](../{target}"
+
+    return re.sub(r"\]\((?!\w+:|#)([^)]+)", moved, (ROOT / f"{name.upper()}.md").read_text())
 
 
 def parameter_tables(name: str) -> str:
@@ -130,8 +147,8 @@ def index_page(families: Mapping[str, Family]) -> str:
     ]
     return "\n".join([
         "# Families\n",
-        "A family is a list of clients whose environments differ. [environments.md](../environments.md) explains the parameters",
-        "and makes families of your own.\n",
+        "A family is a list of clients whose environments differ. [environments.md](../environments.md) explains their",
+        "parameters and makes families of your own.\n",
         "| family | clients | backbone | steps an episode | what it is |",
         "|---|---|---|---|---|",
         *rows,
