@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from pathlib import Path
+from typing import Any
 
 from docutils import nodes
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
+from sphinx.util.inspect import stringify_signature
 from sphinx.util.nodes import make_refnode
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -32,6 +35,7 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_theme_options = {"navigation_with_keys": True}
 copybutton_prompt_text = "$ "
+highlight_language = "text"  # what is not marked as code of a language is for a terminal
 pygments_style = "friendly"
 pygments_dark_style = "monokai"
 
@@ -48,6 +52,16 @@ def complete_page(app: Sphinx, page: str, source: list[str]) -> None:
         app.env.note_dependency(str(pages.ROOT / f"{page.upper()}.md"))
         source[0] = pages.root_page(page)
     source[0] = pages.fill_placeholders(source[0], "../" * page.count("/"))
+
+
+def constructor_signature(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None] | None:
+    """Algorithms check unknown keywords in their metaclass, whose own signature says nothing."""
+    if what != "class" or signature != "(*args: Any, **kwargs: Any)":
+        return None
+    parameters = list(inspect.signature(obj.__init__).parameters.values())[1:]
+    return stringify_signature(inspect.Signature(parameters), unqualified_typehints=True), returns
 
 
 def resolve_short_name(
@@ -68,4 +82,5 @@ def resolve_short_name(
 def setup(app: Sphinx) -> None:
     pages.write_pages()
     app.connect("source-read", complete_page)
+    app.connect("autodoc-process-signature", constructor_signature)
     app.connect("missing-reference", resolve_short_name)

@@ -216,7 +216,7 @@ python train.py --algo local --env {name}
 python -m fed_envs.metadata show {name}
 ```
 
-With settings of its own: {_own_settings(family)}.
+Methods that have settings for this family in `zoo_configs`: {_own_settings(family)}.
 
 ## Results
 
@@ -255,7 +255,7 @@ def _cell(value: object) -> str:
 
 def _own_settings(family: Family) -> str:
     names = [name for name in ALGORITHMS if resolve(name, family).entry == family.name]
-    return ", ".join(f"`{name}`" for name in names) if names else "none; every method takes its `default`"
+    return ", ".join(f"`{name}`" for name in names) if names else "none, all take their `default`"
 
 
 def write_pages(folder: Path = DOCS / "families") -> None:
