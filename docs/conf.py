@@ -51,6 +51,8 @@ def complete_page(app: Sphinx, page: str, source: list[str]) -> None:
     if page in pages.ROOT_PAGES:
         app.env.note_dependency(str(pages.ROOT / f"{page.upper()}.md"))
         source[0] = pages.root_page(page)
+    if page == "results":
+        source[0] = pages.unbroken(source[0])
     source[0] = pages.fill_placeholders(source[0], "../" * page.count("/"))
 
 
@@ -58,9 +60,10 @@ def constructor_signature(
     app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str | None, returns: str | None
 ) -> tuple[str | None, str | None] | None:
     """Algorithms check unknown keywords in their metaclass, whose own signature says nothing."""
-    if what != "class" or signature != "(*args: Any, **kwargs: Any)":
+    if what != "class" or signature is None or not signature.startswith("(*args"):
         return None
     parameters = list(inspect.signature(obj.__init__).parameters.values())[1:]
+    parameters = [parameter for parameter in parameters if not parameter.name.startswith("_")]
     return stringify_signature(inspect.Signature(parameters), unqualified_typehints=True), returns
 
 

@@ -37,6 +37,16 @@ PLACEHOLDER = re.compile(r"<!-- (?P<kind>parameters|results) of (?P<name>\S+) --
 PARAMETER = re.compile(r":param (?P<name>\w+): (?P<text>.*)")
 
 
+def unbroken(text: str) -> str:
+    """Table rows whose figures keep their deviation and unit, and whose methods keep their name, on one line."""
+
+    def row(match: re.Match[str]) -> str:
+        line = re.sub(r"(?<=\d) (?=± |[kMG]?B\b|%)|(?<=±) (?=\d)", "\N{NO-BREAK SPACE}", match[0])
+        return re.sub(r"^\| (fed\w+)-", "| \\1\N{NON-BREAKING HYPHEN}", line)
+
+    return re.sub(r"^\| .*$", row, text, flags=re.MULTILINE)
+
+
 def fill_placeholders(text: str, up: str) -> str:
     """A page with its placeholders replaced.
 
