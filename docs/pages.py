@@ -157,7 +157,7 @@ def index_page(families: Mapping[str, Family]) -> str:
     ]
     return "\n".join([
         "# Families\n",
-        "A family is a list of clients whose environments differ. [environments.md](../environments.md) explains their",
+        "A family is a list of clients whose environments differ. [Environments](../environments.md) explains their",
         "parameters and makes families of your own.\n",
         "| family | clients | backbone | steps an episode | what it is |",
         "|---|---|---|---|---|",
@@ -199,7 +199,7 @@ def family_page(family: Family) -> str:
 
 {client_table(family)}
 
-[environments.md](../environments.md#{WORLDS[family.world]}) says what each parameter acts on.
+[Environments](../environments.md#{WORLDS[family.world]}) says what each parameter acts on.
 
 ## Example
 
