@@ -162,7 +162,8 @@ def test_the_example_of_a_method_runs(name, tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_method_takes_the_actions_that_its_page_names(name):
     page = (DOCS / "algorithms" / f"{name}.md").read_text()
-    named = set(re.findall(r"`(\w+)`", re.search(r"^\| actions \| (.*) \|$", page, re.MULTILINE)[1]))
+    (row,) = re.findall(r"^\| actions \| (.*) \|$", page, re.MULTILINE)
+    named = set(re.findall(r"`(\w+)`", row))
     taken = set()
     for kind, space in ACTIONS.items():
 
