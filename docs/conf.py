@@ -51,6 +51,8 @@ def complete_page(app: Sphinx, page: str, source: list[str]) -> None:
     if page in pages.ROOT_PAGES:
         app.env.note_dependency(str(pages.ROOT / f"{page.upper()}.md"))
         source[0] = pages.root_page(page)
+    if pages.PLACEHOLDER.search(source[0]):
+        app.env.note_dependency(str(pages.RESULTS))
     if page == "results":
         source[0] = pages.unbroken(source[0])
     source[0] = pages.fill_placeholders(source[0], "../" * page.count("/"))
