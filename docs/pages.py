@@ -256,7 +256,7 @@ def client_table(family: Family) -> str:
 
 def _cell(value: object) -> str:
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:.3g}"
     if isinstance(value, list | tuple):
         inner = [f"({_cell(entry)})" if isinstance(entry, list | tuple) else _cell(entry) for entry in value]
         return ", ".join(inner)
