@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -43,6 +44,14 @@ class PointEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _observation(self) -> np.ndarray:
         return np.array([*self.position, self.steps / self.length], dtype=np.float32)
+
+
+def ends_first(clients: Iterable[tuple[str, int]]) -> list[Any]:
+    """Parameters for pairs of a family and a client: all but a family's first and last client are slow tests."""
+    pairs = list(clients)
+    ends = {name: (min(k for other, k in pairs if other == name), max(k for other, k in pairs if other == name))
+            for name, _ in pairs}  # fmt: skip
+    return [pytest.param(name, k, marks=() if k in ends[name] else pytest.mark.slow) for name, k in pairs]
 
 
 def _point_env(target: float) -> gym.Env:

@@ -57,7 +57,8 @@ summary["deployed"]["average"] = 10.0 + seed
 def summary(**changes) -> dict:
     """What a result file holds; ``curve`` goes into ``deployed``."""
     deployed = {"average": 1.0, "worst_client": 0.5, "n_episodes": 3, "success_rates": None, "curve": [[1, 2.0], [2, 4.0]]}
-    deployed.update({name: changes.pop(name) for name in list(changes) if name in deployed})
+    optional = ("client_returns", "client_curve")
+    deployed.update({name: changes.pop(name) for name in list(changes) if name in deployed or name in optional})
     content = {
         "algo": "local", "env": "Bandit2D", "conf_file": "tuned", "n_rounds": 3, "seed": 0, "rounds_done": 3, "finished": True,
         "metadata_hash": fed_envs.load_family("Bandit2D").content_hash, "bytes_up": 6000, "bytes_down": 3_000_000,

@@ -12,9 +12,9 @@ import pytest
 
 import fed_envs
 from sb3_fedguide.benchmark.aggregate import aggregate, bootstrap_interval, interquartile_mean, normalise, random_actions
-from sb3_fedguide.benchmark.results import measure, read_result, read_results, volatility
+from sb3_fedguide.benchmark.results import best_known, measure, read_result, read_results, volatility
 from sb3_fedguide.cli.benchmark import main
-from sb3_fedguide.cli.benchmark_tables import rows_of
+from sb3_fedguide.cli.benchmark_tables import fitting, rows_of
 from tests.test_benchmark_command import write_result
 
 ROOT = Path(__file__).parents[1]
@@ -67,11 +67,47 @@ def test_broadcast_and_the_papers_figure_stand_beside_ours(tmp_path, capfd):
     assert main(["--envs", "HopperHard", "--table-only", "-f", str(tmp_path), "--markdown", "--at-rounds", "2"]) == 0
     assert capfd.readouterr().out == (
         "## HopperHard-tuned\n\n"
-        "| method | seeds | F | worst client | W | CV of the last 20 rounds | round 2 | broadcast | up, down per round "
+        "| method | seeds | F | worst client | W | CV | round 2 | broadcast | up, down per round "
         "| s per round | paper F |\n"
         "|---|---|---|---|---|---|---|---|---|---|---|\n"
         "| fedavg | 2 | 200.5 ± 0.5 | 0.5 | 200 | 0.333 | 4 | 4.5 | 2.0 kB, 1.0 MB | 0.5 | 216 |\n"
     )
+
+
+def test_what_is_said_beside_a_baseline_against_its_definition(tmp_path):
+    """Differences are of the same seeds; the interval is exact for two seeds, whose resamples have three means."""
+    clients = {"local": [[0, 100, [1, 8]], [10, 200, [2, 10]]], "fedavg": [[0, 100, [4, 4]], [10, 200, [5, 5]]]}
+    curve = [[1, 0.0], [2, 3.0], [4, 5.0]]
+    for algo, level in (("local", 5.0), ("fedavg", 6.0)):
+        for seed in (0, 1, *((2,) if algo == "fedavg" else ())):
+            ends = {"client_returns": clients[algo][-1][2], "client_curve": clients[algo], "curve": curve}
+            write_result(tmp_path, algo=algo, seed=seed, average=level + seed * (1 if algo == "local" else 3), **ends)
+    results = read_results(tmp_path, "Bandit2D", "tuned", ["local", "fedavg"])
+    best = best_known(result for runs in results.values() for result in runs)
+    assert best.tolist() == [5.0, 10.0]
+    local, fedavg = (measure(runs, baseline=results["local"], best_known=best) for runs in results.values())
+    assert local.difference is None and local.difference_interval is None
+    assert fedavg.difference == 2.0 and fedavg.difference_interval == (1.0, 3.0)  # seeds 0 and 1: 6 - 5 and 9 - 6
+    assert (local.stuck, fedavg.stuck) == (1.0, 1.0)  # 2 < 0.6 * 5; 5 < 0.6 * 10
+    assert local.area == pytest.approx((1.5 * 1 + 4 * 2) / 3)
+    assert measure(results["fedavg"], best_known=-best).stuck is None
+    assert rows_of([fedavg])[0]["less the baseline's"] == "+2 (1 to 3)"
+
+
+def test_a_narrow_terminal_cuts_neither_methods_nor_figures():
+    row = {
+        "method": "fedguide-a",
+        "seeds": "3",
+        "F": "-32.45 ± 1.27",
+        "speed-up": "1.01",
+        "up, down per round": "317.6 kB, 317.6 kB",
+    }
+    assert fitting([row], 200) == [list(row)]
+    groups = fitting([row, {**row, "method": "local", "F": "-5"}], 60)
+    assert groups == [["method", "seeds", "F", "speed-up"], ["method", "up, down per round"]]
+    lines = 1 + sum(3 + len(row[name]) for name in ("method", "F")) + sum(3 + len(name) for name in ("seeds", "speed-up"))
+    assert fitting([row], lines)[0] == groups[0] and fitting([row], lines - 1)[0] == ["method", "seeds", "F"]
+    assert fitting([row], 5) == [["method", name] for name in list(row)[1:]]  # too narrow for anything: one by one
 
 
 def test_the_interquartile_mean_of_known_scores():

@@ -55,11 +55,9 @@ def test_every_shipped_configuration_constructs_what_it_says(algo, conf, one_cli
 @pytest.mark.parametrize("conf", CONFIGURATIONS)
 @pytest.mark.parametrize("name", fed_envs.FAMILIES)
 def test_methods_are_compared_under_the_same_settings(name, conf):
-    """The same PPO, budget, networks, cloning and normalisation; only the paper's epochs differ between methods."""
+    """The same PPO, budget, networks, cloning and normalisation; only epochs differ between methods."""
     family = fed_envs.load_family(name)
-    shared = {"n_rounds", "policy", *schema.hyperparameters(FederatedPPO)} - {"pretraining"}
-    if conf == "paper":
-        shared -= {"n_epochs"}
+    shared = {"n_rounds", "policy", *schema.hyperparameters(FederatedPPO)} - {"pretraining", "n_epochs"}
     local = resolve("local", family, conf).values
     for algo in ALGORITHMS:
         values = resolve(algo, family, conf).values

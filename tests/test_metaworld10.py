@@ -23,6 +23,8 @@ from fed_envs.metaworld10 import MetaWorldEnv
 FAMILY = fed_envs.load_family("MetaWorld10")
 CLIENTS = range(10)
 PEG, BASKETBALL = 6, 9
+#: Parameters of tests: the first task, the last, and the one with a hole in its model; the others are slow tests.
+SOME_CLIENTS = [pytest.param(k, marks=() if k in (0, PEG, BASKETBALL) else pytest.mark.slow) for k in CLIENTS]
 
 
 def make(client: int, **kwargs) -> gymnasium.Env:
@@ -47,7 +49,7 @@ def test_the_tasks_are_the_papers():
         parse_family({**FAMILY.to_dict(), "clients": [{"client": 0, "task": "juggle-v3"}]}, "mine.json")
 
 
-@pytest.mark.parametrize("client", CLIENTS)
+@pytest.mark.parametrize("client", SOME_CLIENTS)
 def test_an_episode_is_metaworlds_to_the_last_bit(client):
     """A second episode of ours, with the positions it drew, in metaworld's own environment."""
     env = make(client)
@@ -92,7 +94,7 @@ def test_the_global_generator_is_neither_read_nor_changed():
     assert traces[0] == traces[1]
 
 
-@pytest.mark.parametrize("client", CLIENTS)
+@pytest.mark.parametrize("client", SOME_CLIENTS)
 def test_positions_are_drawn_from_the_tasks_region_at_every_reset(client):
     env = make(client)
     env.reset(seed=0)
@@ -134,7 +136,7 @@ def test_environments_of_one_task_leave_each_other_alone(client):
     assert alone[0][0][36:] != alone[1][0][36:]
 
 
-@pytest.mark.parametrize("client", CLIENTS)
+@pytest.mark.parametrize("client", SOME_CLIENTS)
 @pytest.mark.parametrize("steps", [0, 15])
 def test_copies_go_on_like_the_original(client, steps):
     env = make(client)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.ppo import MlpPolicy
 
 from fed_envs import FederatedVecEnv
@@ -231,6 +232,38 @@ def test_what_is_not_supported_is_refused_with_a_reason(point_envs, arguments, e
     if "policy_kwargs" not in arguments and arguments.keys() != {"learning_rat"} and "n_steps" not in arguments:
         with pytest.raises(error):
             FederatedPPO(**{"policy": "MlpPolicy", "env": point_envs(2), **arguments})
+
+
+def test_n_steps_off_policy_are_not_those_of_a_rollout(point_envs):
+    with pytest.raises(ValueError, match=r"n_steps is not supported: .*one-step returns"):
+        FedRL("MlpPolicy", point_envs(2), n_steps=3)
+
+
+def test_vec_normalize_is_a_setting(point_envs):
+    with pytest.raises(ValueError, match=r"single VecNormalize.*normalize=True"):
+        Local("MlpPolicy", VecNormalize(DummyVecEnv(point_envs(1))))
+
+
+@pytest.mark.parametrize(("algorithm", "sizes"), SIZES)
+def test_predict_and_learn_say_what_is_missing(algorithm, sizes, point_envs, tmp_path):
+    model = algorithm("MlpPolicy", point_envs(1), **sizes, **NETWORK)
+    with pytest.raises(ValueError, match="mixing Gym API"):
+        model.predict(point_envs(1)[0]().reset())
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"no environments to train in.*set_env"):
+        loaded.learn(40)
+    loaded.set_env(point_envs(1))
+    assert loaded.learn(40).num_timesteps == 40
+
+
+@pytest.mark.parametrize(("algorithm", "sizes"), SIZES)
+def test_policies_take_numbers_of_any_kind(algorithm, sizes, point_envs):
+    policy = algorithm("MlpPolicy", point_envs(2), **sizes, **NETWORK).policy
+    observations = np.arange(12).reshape(4, 3)
+    actions = [policy.predict(observations.astype(kind), deterministic=True)[0] for kind in (np.float32, np.float64, np.int64)]
+    np.testing.assert_array_equal(actions[0], actions[1])
+    np.testing.assert_array_equal(actions[0], actions[2])
 
 
 def test_statistics_are_one_mixin():

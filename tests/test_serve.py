@@ -13,7 +13,7 @@ import sb3_fedguide
 from sb3_fedguide.common.checkpoint_files import checkpoints
 from sb3_fedguide.server.averaging import weighted_average
 from sb3_fedguide.server.build import complete_settings
-from sb3_fedguide.server.figures import ClientEvaluation
+from sb3_fedguide.server.figures import ClientEvaluation, count_tests
 from sb3_fedguide.server.serve import Server, TooFewClients
 from sb3_fedguide.server.transport import Failure, Message
 from tests.loop_transport import CONFIG, NAME, STATED, Client, LoopTransport, replaced, run, timeout
@@ -366,3 +366,11 @@ def test_an_unknown_kind_of_message_is_refused():
     with pytest.raises(ValueError, match="kind 'shell'"):
         Message("shell", 1)
     assert Failure.of(KeyError("secret")).reason == "error: KeyError"
+
+
+def test_numbers_of_steps_that_are_none_are_not_counted():
+    counted = {1: 10}
+    said = [{"test_steps": 5}, {"test_steps": 12}, {"test_steps": -3}, {"test_steps": True}, {"test_steps": 2**60}, {}]
+    assert count_tests(dict(enumerate(said)), counted) == 5 + 2
+    assert counted == {0: 5, 1: 12}
+    assert count_tests({0: {"test_steps": 4}, 1: {"test_steps": "20"}, 2: {"test_steps": 3}}, counted) == 3

@@ -97,6 +97,17 @@ def test_three_sites_learn_what_three_clients_learn_in_one_process(algo, tmp_pat
     assert_equal(transport, in_process(algo, "Bandit2D"))
 
 
+def test_the_server_counts_the_clients_tests_as_environment_steps(tmp_path):
+    """Those of a round are known with the next one; after the last average nothing is tested."""
+    config, transport = federation("fedguide-r", "Bandit2D", tmp_path, fresh=True)
+    server = serve(config, transport, tmp_path / "server")
+    model = in_process("fedguide-r", "Bandit2D")
+    assert server.timesteps[-1] == model.environment_steps == model.num_timesteps + model.test_steps
+    assert model.test_steps > 0 and server.test_steps == {
+        client: transport.site(client).model.test_steps for client in CLIENTS
+    }
+
+
 def test_off_policy_clients_in_a_simulator_with_some_absent(tmp_path):
     more = {"client_fraction": 0.7, "learning_rate": linear}
     config, transport = federation("fedrl", "Hopper", tmp_path, **more)

@@ -87,10 +87,20 @@ def bootstrap_interval(
 
     :param groups: one array ``(n_runs,)`` per family
     """
-    rng = np.random.default_rng(seed)
-    resampled = [group[rng.integers(0, len(group), (n_resamples, len(group)))] for group in groups]
-    low, high = np.quantile(interquartile_mean(resampled), [(1 - confidence) / 2, (1 + confidence) / 2])
+    low, high = np.quantile(
+        interquartile_mean(resample(groups, n_resamples, seed)), [(1 - confidence) / 2, (1 + confidence) / 2]
+    )
     return float(low), float(high)
+
+
+def resample(groups: Sequence[np.ndarray], n_resamples: int = RESAMPLES, seed: int = 0) -> list[np.ndarray]:
+    """Bootstrap samples, stratified: each family's runs are drawn from its own.
+
+    :param groups: one array ``(n_runs,)`` per family
+    :return: one array ``(n_resamples, n_runs)`` per family
+    """
+    rng = np.random.default_rng(seed)
+    return [group[rng.integers(0, len(group), (n_resamples, len(group)))] for group in groups]
 
 
 def random_actions(family: Family, n_episodes: int = 10) -> Evaluation:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,12 @@ from sb3_fedguide.benchmark.paper import PAPER_F
 
 #: CV is taken over so many rounds at the end of a run, all of which are evaluated.
 LAST_ROUNDS = 20
+
+#: A client is stuck whose return is below this share of the best that is known of it.
+STUCK = 0.6
+
+#: Resamples of the bootstrap interval of a difference.
+RESAMPLES = 10_000
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,12 @@ class Result:
     :param offline_bytes_up: once, before the first round; ``offline_bytes_down`` likewise
     :param median_seconds: of the median round
     :param config: hyperparameters; ``None`` where the file does not say
+    :param clients: their numbers; empty where the file does not say
+    :param client_finals: each client's return in the evaluation that ``final`` is of; empty where the file does not say
+    :param client_curve: evaluated round to each client's return; empty in files of earlier versions
+    :param steps_per_round: environment steps of all clients in a round without tests; ``None`` where the file does not say
+    :param round_seconds: of all rounds together: rollout, training and exchange; ``None`` where the file does not say
+    :param total_bytes: up and down, of all clients together, with what was sent before the first round
     """
 
     path: Path
@@ -60,6 +72,12 @@ class Result:
     offline_bytes_down: float | None
     median_seconds: float
     config: Mapping[str, Any] | None
+    clients: Sequence[int]
+    client_finals: Sequence[float]
+    client_curve: Mapping[int, Sequence[float]]
+    steps_per_round: float | None
+    round_seconds: float | None
+    total_bytes: float
 
 
 @dataclass(frozen=True)
@@ -72,6 +90,11 @@ class Measures:
     :param worst_client: the lowest client's return, averaged over seeds
     :param speed_up: rounds of a run over the first evaluated round in which the curve is at the target; ``None`` without a
         target, or where it is never reached
+    :param area: mean of the curve from the first to the last evaluated round, by environment steps, averaged over seeds
+    :param difference: F less that of the baseline over the seeds that both have, and the 95 % bootstrap interval of the paired
+        differences, where there are two such seeds; ``None`` without a baseline
+    :param stuck: clients per run whose return is below :data:`STUCK` of the best known of them; ``None`` where that is not
+        known, or not positive
     :param curve: asked-for round to client-average return, averaged over seeds; without those that were not evaluated
     :param seconds_per_round: the fastest seed's median: other work on the machine only adds
     :param paper_F: of the paper
@@ -94,6 +117,10 @@ class Measures:
     seconds_per_round: float
     paper_F: float | None
     speed_up: float | None = None
+    area: float | None = None
+    difference: float | None = None
+    difference_interval: tuple[float, float] | None = None
+    stuck: float | None = None
 
 
 def result_folder(folder: Path, family: str, label: str) -> Path:
@@ -110,7 +137,7 @@ def read_result(path: Path) -> Result:
     """:raises ValueError: if the file is damaged, or of a run that was not finished"""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        result = _result(path, content)
+        result = parse_result(path, content)
     except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{path} is not the result of a run ({reason}); delete it to repeat the run") from None
@@ -121,7 +148,12 @@ def read_result(path: Path) -> Result:
     return result
 
 
-def _result(path: Path, content: dict[str, Any]) -> Result:
+def parse_result(path: Path, content: Mapping[str, Any]) -> Result:
+    """The content of a result file, or the ``summary.json`` of a run's folder.
+
+    :raises ValueError: of a run that was not finished
+    :raises KeyError, TypeError, AttributeError: where something is missing or no number
+    """
     if content["finished"] is not True:
         raise ValueError(f"it ended after {content['rounds_done']} of {content['n_rounds']} rounds")
     deployed, rates = content["deployed"], content["deployed"].get("success_rates")
@@ -154,6 +186,14 @@ def _result(path: Path, content: dict[str, Any]) -> Result:
         offline_bytes_down=offline[1],
         median_seconds=float(content["seconds"]["median_round"]),
         config=None if config is None else dict(config),
+        clients=[int(client) for client in content.get("clients", ())],
+        client_finals=final or [float(value) for value in deployed.get("client_returns", ())],
+        client_curve={
+            int(round): [float(value) for value in returns] for round, _, returns in deployed.get("client_curve", ())
+        },
+        steps_per_round=_steps_per_round(content) if "timesteps" in content else None,
+        round_seconds=_round_seconds(content["seconds"]),
+        total_bytes=float(content["bytes_up"]) + float(content["bytes_down"]),
     )
 
 
@@ -170,8 +210,17 @@ def _spent(content: Mapping[str, Any]) -> dict[int, float]:
     deployed, tests = content["deployed"], content.get("test_timesteps", 0)
     if not tests:
         return {int(round): float(round) for round, _ in deployed["curve"]}
-    per_round = (content["timesteps"] - tests) / content["rounds_done"]
+    per_round = _steps_per_round(content)
     return {int(round): steps / per_round for round, steps, _ in deployed["client_curve"]}
+
+
+def _steps_per_round(content: Mapping[str, Any]) -> float:
+    return (content["timesteps"] - content.get("test_timesteps", 0)) / content["rounds_done"]
+
+
+def _round_seconds(seconds: Mapping[str, Any]) -> float | None:
+    parts = ("rollout", "train", "exchange")
+    return sum(float(seconds[part]) for part in parts) if all(part in seconds for part in parts) else None
 
 
 #: Methods whose clients train a prior's trunk together.
@@ -208,25 +257,36 @@ def read_results(
         wanted = [seed for seed in numbers if seeds is None or seed in seeds]
         if wanted:
             found[method] = [read_result(result_path(folder, family, label, method, seed)) for seed in wanted]
-    everything = [result for results in found.values() for result in results]
-    for result in everything:
-        first = everything[0]
+    check_comparable([result for results in found.values() for result in results])
+    return found
+
+
+def check_comparable(results: Sequence[Result]) -> None:
+    """:raises ValueError: for runs on one family with other clients, or another number of rounds or of episodes"""
+    for result in results:
+        first = results[0]
         for name, what in (("n_rounds", "rounds"), ("metadata_hash", "clients"), ("n_episodes", "episodes")):
             if getattr(result, name) != getattr(first, name):
                 raise ValueError(
                     f"{result.path} and {first.path} cannot stand in one table: their {what} differ ({getattr(result, name)} "
                     f"and {getattr(first, name)}); move one of them to the folder of another label"
                 )
-    return found
 
 
-def measure(results: Sequence[Result], at_rounds: Sequence[int] = (), target: float | None = None) -> Measures:
+def measure(
+    results: Sequence[Result],
+    at_rounds: Sequence[int] = (),
+    baseline: Sequence[Result] | None = None,
+    best_known: np.ndarray | None = None,
+) -> Measures:
     """The measures of one method on one family.
 
     :param results: one per seed
     :param at_rounds: rounds of the curve to report as well
-    :param target: return that counts for the speed-up, such as F of another method
+    :param baseline: results of the method whose F counts for the speed-up, and from which differences are taken
+    :param best_known: the best return known of each client, ``(n_clients,)``
     """
+    paired = [] if baseline is None or baseline is results else paired_differences(results, baseline)
     final = np.array([result.final for result in results])
     success = [result.success for result in results if result.success is not None]
     broadcast = [result.broadcast for result in results if result.broadcast is not None]
@@ -254,7 +314,11 @@ def measure(results: Sequence[Result], at_rounds: Sequence[int] = (), target: fl
         offline_bytes_down=_known_mean([result.offline_bytes_down for result in results]),
         seconds_per_round=min(result.median_seconds for result in results),
         paper_F=PAPER_F.get(results[0].family, {}).get(results[0].method),
-        speed_up=None if target is None else speed_up(results, target),
+        speed_up=None if baseline is None else speed_up(results, float(np.mean([result.final for result in baseline]))),
+        area=float(np.mean([area(result) for result in results])),
+        difference=float(np.mean(paired)) if len(paired) else None,
+        difference_interval=mean_interval(np.array(paired)) if len(paired) > 1 else None,
+        stuck=None if best_known is None else stuck_clients(results, best_known),
     )
 
 
@@ -268,6 +332,40 @@ def speed_up(results: Sequence[Result], target: float) -> float | None:
         if np.mean([result.curve[round] for result in results]) >= target:
             return results[0].n_rounds / float(np.mean([result.spent[round] for result in results]))
     return None
+
+
+def area(result: Result) -> float:
+    """The mean of a run's curve over environment steps, from the first to the last evaluation, by the trapezoidal rule."""
+    rounds = sorted(result.curve)
+    values, spent = [result.curve[round] for round in rounds], [result.spent[round] for round in rounds]
+    return float(np.trapezoid(values, spent) / (spent[-1] - spent[0])) if len(rounds) > 1 else values[0]
+
+
+def paired_differences(results: Sequence[Result], baseline: Sequence[Result]) -> list[float]:
+    """F of each seed less the baseline's with the same seed."""
+    theirs = {result.seed: result.final for result in baseline}
+    return [result.final - theirs[result.seed] for result in results if result.seed in theirs]
+
+
+def mean_interval(values: np.ndarray, confidence: float = 0.95, seed: int = 0) -> tuple[float, float]:
+    """Percentile bootstrap interval of the mean of ``values``, ``(n,)``."""
+    rng = np.random.default_rng(seed)
+    means = values[rng.integers(0, len(values), (RESAMPLES, len(values)))].mean(axis=1)
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)
+
+
+def best_known(results: Iterable[Result]) -> np.ndarray | None:
+    """The best return of each client in any of the runs, ``(n_clients,)``; ``None`` where a file does not say."""
+    best = [np.max([result.client_finals, *result.client_curve.values()], axis=0) for result in results]
+    return np.max(best, axis=0) if all(len(returns) for returns in best) else None
+
+
+def stuck_clients(results: Sequence[Result], best: np.ndarray) -> float | None:
+    """Clients per run whose return is below :data:`STUCK` of the best known; ``None`` unless all of those are positive."""
+    if not (best > 0).all():
+        return None
+    return float(np.mean([(np.array(result.client_finals) < STUCK * best).sum() for result in results]))
 
 
 def _known_mean(values: Sequence[float | None]) -> float | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ from sb3_fedguide.cli.train import (
 
 if TYPE_CHECKING:
     from fed_envs import Family
+    from sb3_fedguide.benchmark.results import Result
     from sb3_fedguide.cli.benchmark_runs import BenchmarkRun, Outcome
     from sb3_fedguide.cli.benchmark_tables import Tables
     from sb3_fedguide.cli.config import Config
@@ -98,14 +99,8 @@ def make_plan(arguments: argparse.Namespace, prog: str) -> Plan:
 
     :raises ValueError: for anything that a user can put right
     """
-    sources = [("--env", name) for name in arguments.envs] + [("--metadata", file) for file in arguments.metadata]
     methods, flags = arguments.algos or list(ALGORITHMS), train_flags(arguments, SETTINGS + PASSED_ON)
-    families = {}
-    for source in sources:
-        family = find_family(parse_train([*source, *flags], prog))
-        if family.name in families:
-            raise ValueError(f"{source[1]}: the family {family.name} is given twice")
-        families[family.name] = family
+    sources, families = _sources(arguments), find_families(arguments, prog)
     if arguments.table_only:
         _require_results(arguments, families)
         return Plan(families, (), 0)
@@ -126,6 +121,24 @@ def make_plan(arguments: argparse.Namespace, prog: str) -> Plan:
             if not run.result.is_file():
                 runs.append(run)
     return Plan(families, runs, n_done)
+
+
+def _sources(arguments: argparse.Namespace) -> list[tuple[str, str]]:
+    return [("--env", name) for name in arguments.envs] + [("--metadata", file) for file in arguments.metadata]
+
+
+def find_families(arguments: argparse.Namespace, prog: str) -> dict[str, Family]:
+    """The families of ``--envs`` and ``--metadata``, by name in the order given.
+
+    :raises ValueError: for one that is unknown, or is given twice
+    """
+    families: dict[str, Family] = {}
+    for source in _sources(arguments):
+        family = find_family(parse_train([*source, *train_flags(arguments, SETTINGS + PASSED_ON)], prog))
+        if family.name in families:
+            raise ValueError(f"{source[1]}: the family {family.name} is given twice")
+        families[family.name] = family
+    return families
 
 
 def _benchmark_run(
@@ -184,11 +197,16 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str =
 
 
 def _require_results(arguments: argparse.Namespace, families: Mapping[str, Family]) -> None:
-    for name, measures in _results(arguments, families).items():
+    for name, measures in benchmark_results(arguments, families).items():
         if not measures:
-            there = sorted(path.parent.name for path in Path(arguments.folder).glob("*/*-seed*.json"))
-            known = f"; there are {', '.join(dict.fromkeys(there))}" if there else ""
-            raise ValueError(f"{arguments.folder} has no results of {name} with these methods and seeds{known}")
+            raise ValueError(no_results(arguments.folder, name))
+
+
+def no_results(folder: str, family: str) -> str:
+    """The message for a family without results, with the folders of results that there are."""
+    there = sorted(path.parent.name for path in Path(folder).glob("*/*-seed*.json"))
+    known = f"; there are {', '.join(dict.fromkeys(there))}" if there else ""
+    return f"{folder} has no results of {family} with these methods and seeds{known}"
 
 
 def _run(arguments: argparse.Namespace, plan: Plan) -> int:
@@ -228,7 +246,7 @@ def _run(arguments: argparse.Namespace, plan: Plan) -> int:
 
                 run_on_ray(plan.runs, arguments.processes, signals, done)
             else:
-                run_here(plan.runs, arguments.processes or 1, signals, done)
+                run_here(plan.runs, arguments.processes or 1, signals, done, _say)
         except KeyboardInterrupt:
             pass  # the second signal: the runs are ended, and the first one is in signals.received
     unfinished = sum(not run.result.is_file() for run in plan.runs)
@@ -245,7 +263,8 @@ def _say(message: str) -> None:
     print(message, file=sys.stderr, flush=True)
 
 
-def _results(arguments: argparse.Namespace, families: Mapping[str, Family]) -> dict[str, Any]:
+def benchmark_results(arguments: argparse.Namespace, families: Iterable[str]) -> dict[str, dict[str, list[Result]]]:
+    """Family to method to its results."""
     from sb3_fedguide.benchmark.results import read_results
 
     seeds = arguments.seeds or (None if arguments.table_only else SEEDS)
@@ -259,15 +278,16 @@ def make_tables(arguments: argparse.Namespace, families: Mapping[str, Family], a
     :param aggregated: whether several families are aggregated
     :raises ValueError: for a damaged result file
     """
-    from sb3_fedguide.benchmark.results import measure
+    from sb3_fedguide.benchmark.results import best_known, measure
     from sb3_fedguide.cli.benchmark_tables import Tables
 
-    found = {name: results for name, results in _results(arguments, families).items() if results}
+    found = {name: results for name, results in benchmark_results(arguments, families).items() if results}
     rows = {}
     for name, results in found.items():
         baseline = results.get(arguments.baseline)
-        target = None if baseline is None or len(results) < 2 else measure(baseline).F
-        rows[f"{name}-{arguments.label}"] = [measure(runs, arguments.at_rounds, target) for runs in results.values()]
+        baseline = baseline if len(results) > 1 else None
+        best = best_known(run for runs in results.values() for run in runs)
+        rows[f"{name}-{arguments.label}"] = [measure(runs, arguments.at_rounds, baseline, best) for runs in results.values()]
     if len(found) < 2 or not aggregated:
         return Tables(rows, (), ())
     complete = [method for method in next(iter(found.values())) if all(method in results for results in found.values())]
@@ -278,7 +298,7 @@ def make_tables(arguments: argparse.Namespace, families: Mapping[str, Family], a
 
     finals = {name: {method: [run.final for run in results[method]] for method in complete} for name, results in found.items()}
     means = {name: sum(values[arguments.baseline]) / len(values[arguments.baseline]) for name, values in finals.items()}
-    levels = {name: (_random_level(Path(arguments.folder), families[name]), means[name]) for name in found}
+    levels = {name: (random_level(Path(arguments.folder), families[name]), means[name]) for name in found}
     if too_low := [f"{name} ({high:.4g}, random actions {low:.4g})" for name, (low, high) in levels.items() if not low < high]:
         note = f"no aggregate: the baseline, {arguments.baseline}, is no better than random actions on {', '.join(too_low)}"
         return Tables(rows, (), (note,))
@@ -290,7 +310,7 @@ def make_tables(arguments: argparse.Namespace, families: Mapping[str, Family], a
     return Tables(rows, aggregates, notes)
 
 
-def _random_level(folder: Path, family: Family) -> float:
+def random_level(folder: Path, family: Family) -> float:
     """What random actions return, measured once and kept with the results."""
     from sb3_fedguide.benchmark.aggregate import random_actions
     from sb3_fedguide.cli.run_folder import write_json

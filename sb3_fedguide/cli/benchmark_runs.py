@@ -20,11 +20,14 @@ from sb3_fedguide.cli.config import read_yaml
 from sb3_fedguide.cli.resume import finished_rounds
 from sb3_fedguide.cli.run_folder import exclusive
 from sb3_fedguide.cli.signals import StopSignals
+from sb3_fedguide.cli.status import read_status
 
 #: The training command; a run's flags follow.
 TRAIN = (sys.executable, "-m", "sb3_fedguide", "train")
 #: Seconds between looks at the runs.
 POLL = 0.1
+#: Seconds between reports of what runs are doing.
+REPORT = 60.0
 #: How much of a failed run's output its report shows.
 SHOWN_LINES = 12
 
@@ -111,6 +114,12 @@ class RunProcess:
     def is_running(self) -> bool:
         return self._process is not None and self._process.poll() is None
 
+    def doing(self) -> str:
+        """Its stage, how long that has taken, and what is left of it."""
+        folder = interrupted_folder(self.run.log_folder, self.run.method)
+        stage = None if folder is None else read_status(folder)
+        return "beginning" if stage is None else str(stage)
+
     def stop(self) -> None:
         """Let it end after its running round, with a checkpoint."""
         if not self._stopped and self._process is not None:
@@ -174,15 +183,20 @@ def execute(run: BenchmarkRun) -> Outcome:
 
 
 def run_here(
-    runs: Sequence[BenchmarkRun], n_processes: int, signals: StopSignals, done: Callable[[BenchmarkRun, Outcome], None]
+    runs: Sequence[BenchmarkRun],
+    n_processes: int,
+    signals: StopSignals,
+    done: Callable[[BenchmarkRun, Outcome], None],
+    say: Callable[[str], None],
 ) -> None:
     """Do the runs in processes on this machine.
 
     :param n_processes: so many at a time
     :param signals: after the first signal, nothing is begun and what runs ends after its round; at the second, all are killed
     :param done: called for each run that ends, and for those that could not be started
+    :param say: called every minute with what each run is doing
     """
-    waiting, running = deque(runs), list[RunProcess]()
+    waiting, running, reported = deque(runs), list[RunProcess](), time.monotonic()
     try:
         while running or (waiting and signals.received is None):
             if signals.received is not None:
@@ -198,6 +212,10 @@ def run_here(
                 done(process.run, process.outcome())
                 running.remove(process)
                 process.release()
+            if time.monotonic() - reported >= REPORT:
+                reported = time.monotonic()
+                for process in running:
+                    say(f"  {process.run.name}: {process.doing()}")
             time.sleep(POLL)
     finally:
         for process in running:

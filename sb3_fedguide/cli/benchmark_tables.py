@@ -34,6 +34,12 @@ class Tables:
 
 Row = dict[str, str]
 
+#: Below the tables on the terminal.
+LEGEND = (
+    "F: client-average return at the end, mean ± deviation over seeds; W: its worst seed; CV: deviation over absolute mean in "
+    "the last rounds, twenty at most"
+)
+
 
 def rows_of(measures: Sequence[Measures]) -> list[Row]:
     """The cells of one family's table by column; columns that no method has a value for are left out."""
@@ -42,10 +48,12 @@ def rows_of(measures: Sequence[Measures]) -> list[Row]:
         "method": lambda row: row.method,
         "seeds": lambda row: str(len(row.seeds)),
         "F": lambda row: f"{row.F:.4g} ± {row.F_std:.3g}" if len(row.seeds) > 1 else f"{row.F:.4g}",
+        "less the baseline's": lambda row: _difference(row),
         "speed-up": lambda row: _number(row.speed_up, ".2f"),
         "worst client": lambda row: f"{row.worst_client:.4g}",
+        "stuck": lambda row: _number(row.stuck, ".2g"),
         "W": lambda row: f"{row.W:.4g}",
-        "CV of the last 20 rounds": lambda row: _number(row.CV, ".3f"),
+        "CV": lambda row: _number(row.CV, ".3f"),
         **{f"round {round}": partial(_at_round, round) for round in rounds},
         "broadcast": lambda row: _number(row.broadcast, ".4g"),
         "success": lambda row: _number(row.success, ".2f"),
@@ -88,25 +96,48 @@ def _sizes(up: float | None, down: float | None) -> str | None:
     return None if up is None or down is None else f"{format_size(up)}, {format_size(down)}"
 
 
+def _difference(row: Measures) -> str | None:
+    if row.difference is None:
+        return None
+    interval = "" if row.difference_interval is None else " ({:.3g} to {:.3g})".format(*row.difference_interval)
+    return f"{row.difference:+.3g}{interval}"
+
+
 def _number(value: float | None, form: str) -> str | None:
     return None if value is None else format(value, form)
 
 
 def print_tables(tables: Tables) -> None:
-    """On the terminal."""
+    """On the terminal; what is wider than it is continued below, the methods named again."""
     from rich.console import Console
     from rich.table import Table
 
     console = Console(width=None if Console().is_terminal else 160)
     for title, rows in _titled(tables):
-        table = Table(title=title, title_justify="left")
-        for name in rows[0]:
-            table.add_column(name, justify="left" if name == "method" else "right")
-        for row in rows:
-            table.add_row(*row.values())
-        console.print(table)
-    for note in tables.notes:
+        for part, columns in enumerate(fitting(rows, console.width)):
+            table = Table(title="" if part else title, title_justify="left")
+            for name in columns:
+                table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
+            for row in rows:
+                table.add_row(*(row[name] for name in columns))
+            console.print(table)
+    for note in (LEGEND, *tables.notes):
         console.print(note, highlight=False, soft_wrap=True)
+
+
+def fitting(rows: Sequence[Row], width: int) -> list[list[str]]:
+    """The columns in groups that are at most so many characters wide, each with the first column before it."""
+    first, *others = rows[0]
+    sizes = {name: 3 + max(len(name), *(len(row[name]) for row in rows)) for name in rows[0]}  # padding and a border
+    groups: list[list[str]] = []
+    left = 0
+    for name in others:
+        if sizes[name] > left:
+            groups.append([first])
+            left = width - 1 - sizes[first]
+        groups[-1].append(name)
+        left -= sizes[name]
+    return groups
 
 
 def _titled(tables: Tables) -> list[tuple[str, list[Row]]]:

@@ -14,6 +14,7 @@ USAGE = """usage: fedguide COMMAND ...
   evaluate   evaluate a finished run's policies, client by client
   export     clients' policies for use elsewhere: Stable-Baselines3, TorchScript, torch.export, ONNX
   benchmark  methods on families with seeds, as runs that can be interrupted, and tables of their results
+  plot       figures of a benchmark's results or of runs: learning curves, bars, clients, aggregates, speed-up
   deploy     a federation over a network: certificates, keys, server and clients
   dataset    a Minari dataset for the offline stage from CSV or NPZ logs
   demo       FedAvg beside FedGuide on Bandit2D, with a picture
@@ -38,6 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "evaluate": _evaluate,
         "export": _export,
         "benchmark": _benchmark,
+        "plot": _plot,
         "deploy": _deploy,
         "dataset": _dataset,
         "demo": _demo,
@@ -69,6 +71,12 @@ def _export(argv: Sequence[str]) -> int:
 
 def _benchmark(argv: Sequence[str]) -> int:
     from sb3_fedguide.cli.benchmark import main
+
+    return main(argv)
+
+
+def _plot(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.plot import main
 
     return main(argv)
 

@@ -145,9 +145,11 @@ class Run:
     def _train(self, folder: Path, signals: StopSignals) -> None:
         from sb3_fedguide.cli.recorder import CostCallback, DeployedCallback, RunEvalCallback, StopCallback
         from sb3_fedguide.cli.run_folder import CHECKPOINTS, EVALUATIONS
+        from sb3_fedguide.cli.status import Status
         from sb3_fedguide.common.checkpoint import CheckpointCallback
         from sb3_fedguide.engines import make_engine
         from sb3_fedguide.engines.engine import EngineError
+        from sb3_fedguide.offline.progress import TqdmProgress
 
         arguments, model = self.arguments, self.model
         self._costs, self._deployed, self._evaluation = CostCallback(), DeployedCallback(), None
@@ -155,13 +157,14 @@ class Run:
             self._evaluation = RunEvalCallback(
                 self.config.n_rounds, arguments.eval_freq, arguments.eval_episodes, folder / EVALUATIONS
             )
+        status = Status(folder, self.config.n_rounds, TqdmProgress() if arguments.progress else None)
         try:
-            model.pretrain(progress_bar=arguments.progress)
+            model.pretrain(progress=status)
         except ValueError as error:
             raise OfflineStageError(str(error)) from error
         self._costs.pretraining_seconds = self._costs.total_seconds
         checkpoint = CheckpointCallback(folder / CHECKPOINTS, arguments.save_freq) if arguments.save_freq else None
-        recorders = [self._evaluation, self._costs, self._deployed]
+        recorders = [self._evaluation, self._costs, self._deployed, status]
         callbacks = [*recorders, *self._monitoring(), checkpoint, StopCallback(signals, checkpoint)]
         engine = make_engine(arguments.engine, arguments.num_actors, arguments.ray_address)
         with ExitStack() as stack:
@@ -173,6 +176,7 @@ class Run:
             self._learn(callbacks)
         if checkpoint is not None and model.round >= self.config.n_rounds:
             checkpoint.save()  # for --resume with more rounds
+        status.remove()
 
     def _learn(self, callbacks: list[RoundCallback | None]) -> None:
         model = self.model

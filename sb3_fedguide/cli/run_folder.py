@@ -23,19 +23,21 @@ PARAMETERS = "parameters.npz"
 DEPLOYED = "deployed.npz"
 CHECKPOINTS = "checkpoints"
 EVALUATIONS = "evaluations.csv"
+#: The stage of a run that is under way: see :mod:`sb3_fedguide.cli.status`.
+STATUS = "status.json"
 PACKAGES = (
     "sb3-fedguide", "stable-baselines3", "gymnasium", "gymnasium-robotics", "metaworld", "mujoco", "torch", "numpy", "scipy",
     "POT", "minari", "pydantic", "tensorboard",
 )  # fmt: skip
 
 
-def check_log_folder(folder: Path) -> None:
+def check_log_folder(folder: Path, what: str = "log folder", flag: str = "-f") -> None:
     """:raises ValueError: if no run could be written below ``folder``; nothing is created"""
     existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not existing.is_dir():
-        raise ValueError(f"the log folder {folder} cannot be made: {existing} is a file; give another one with -f")
+        raise ValueError(f"the {what} {folder} cannot be made: {existing} is a file; give another one with {flag}")
     if not os.access(existing, os.W_OK):
-        raise ValueError(f"the log folder {folder} cannot be written to ({existing}); give another one with -f")
+        raise ValueError(f"the {what} {folder} cannot be written to ({existing}); give another one with {flag}")
 
 
 def create_run_folder(log_folder: Path, algo: str, family: str) -> Path:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from fed_envs import FederatedVecEnv
 
@@ -142,9 +142,10 @@ def as_federated_env(
     if env is None or isinstance(env, FederatedVecEnv):
         return env
     if isinstance(env, VecEnv | gym.Env):
+        hint = "; normalize=True does what VecNormalize does, for each client" if isinstance(env, VecNormalize) else ""
         raise ValueError(
             f"a federation needs one environment per client, but got a single {type(env).__name__}; pass a family name, "
-            "a metadata file, a fed_envs.FederatedVecEnv or a list of environment factories"
+            f"a metadata file, a fed_envs.FederatedVecEnv or a list of environment factories{hint}"
         )
     return FederatedVecEnv(env, n_envs_per_client=n_envs_per_client, clients=clients, num_threads=num_threads)
 

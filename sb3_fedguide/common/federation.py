@@ -167,7 +167,12 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfFederation:
-        """Train for ``total_timesteps`` steps of all clients together, rounded up to whole rounds; otherwise as in SB3."""
+        """Train for ``total_timesteps`` steps of all clients together, rounded up to whole rounds; otherwise as in SB3.
+
+        :raises ValueError: where there are no environments, as in a model that was loaded without
+        """
+        if self.env is None:
+            raise ValueError(f"this {type(self).__name__} has no environments to train in; give it some with set_env()")
         self.pretrain(progress_bar)
         total_timesteps, callbacks, rounds = self.start_learning(
             total_timesteps, callback, tb_log_name, reset_num_timesteps, progress_bar
@@ -279,8 +284,13 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Actions of all clients for raw observations, ``(n_clients * batch, obs_dim)``, client-major.
 
-        :raises ValueError: where the observations cannot be divided among the clients
+        :raises ValueError: where the observations cannot be divided among the clients, or come with an info
         """
+        if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
+            raise ValueError(
+                "predict() takes an array of observations, but got a tuple (observation, info): this is mixing Gym API, "
+                "`observation, info = env.reset()`, with SB3's VecEnv API, `observations = vec_env.reset()`"
+            )
         observation = np.asarray(observation)
         if observation.ndim != 2 or len(observation) % self.n_clients:
             raise ValueError(

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_fedguide.common.stacked_policy import StackedPolicy
@@ -44,6 +45,8 @@ UNSUPPORTED = {
     "monitor_wrapper": "episodes are recorded by FederatedVecEnv, without a wrapper",
     "support_multi_env": "a federation always has several environments",
 }  # fmt: skip
+#: what a keyword means to an off-policy algorithm, where that is something else
+_OFF_POLICY = {"n_steps": "the critics' targets are one-step returns, as in DDPG's paper"}
 
 
 #: what to do instead of SB3's other policies
@@ -60,7 +63,8 @@ def check_keywords(cls: type, given: Iterable[str]) -> None:
     known = _constructor_names(cls)
     for name in given:
         if name not in known:
-            _refuse(name, known, f"{cls.__name__}()")
+            reasons = {**UNSUPPORTED, **_OFF_POLICY} if issubclass(cls, OffPolicyAlgorithm) else UNSUPPORTED
+            _refuse(name, known, f"{cls.__name__}()", reasons)
 
 
 def check_policy(policy: Any, aliases: Mapping[str, type[BasePolicy]], cls: type) -> None:
@@ -91,9 +95,9 @@ def check_policy_keywords(policy_class: type, given: Mapping[str, Any]) -> None:
             _refuse(name, known, "policy_kwargs")
 
 
-def _refuse(name: str, known: set[str], where: str) -> None:
-    if name in UNSUPPORTED:
-        raise ValueError(f"{name} is not supported: {UNSUPPORTED[name]}")
+def _refuse(name: str, known: set[str], where: str, reasons: Mapping[str, str] = UNSUPPORTED) -> None:
+    if name in reasons:
+        raise ValueError(f"{name} is not supported: {reasons[name]}")
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
     hint = f"; did you mean {near[0]!r}?" if near else f"; it takes {', '.join(sorted(known))}"
     raise TypeError(f"{where} has no argument {name!r}{hint}")

@@ -35,7 +35,7 @@ class ParameterAveraging(Federation):
     :param server_momentum: share of the server's last update that is added to the next one
     :param mix: share of what the server sends that a client takes into its own parameters: a number, or a schedule of the
         remaining progress, bounded to [0, 1]. In a configuration ``lin_1`` falls from all to nothing over the run, and
-        ``until_0.5`` takes all for half of the run and nothing after it, so that everybody ends with a policy of its own
+        ``until_0.4`` takes all for two fifths of the run and nothing after it, so that everybody ends with a policy of its own
     :param screening: share of its environment steps that a client may spend on tests of what the server sends against its own
         policy, see :class:`~sb3_fedguide.common.screening.Screening`; with 0 it takes it untested
     :raises ValueError: for values out of range

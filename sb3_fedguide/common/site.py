@@ -206,6 +206,7 @@ class Site:
         return model.outgoing(0), {
             "figures": self._log.figures if self._report else {},
             "evaluations": evaluations,
+            **({"test_steps": self.model.test_steps} if self.model.test_steps else {}),
         }
 
     def _finish(self, message: Message) -> Answer:

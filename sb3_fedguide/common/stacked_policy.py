@@ -29,6 +29,7 @@ class StackedPolicy(BasePolicy):
 
         :raises ValueError: where the rows cannot be divided among the clients
         """
+        obs = obs.float()  # as SB3's policies, which take numbers of any kind
         if obs.dim() == 3 and obs.shape[0] == self.n_clients:
             return obs
         if obs.shape[0] % self.n_clients:

@@ -14,6 +14,7 @@ from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
 from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
+from sb3_fedguide.offline.progress import Progress
 from sb3_fedguide.server.payload import Payload
 
 if TYPE_CHECKING:
@@ -39,8 +40,10 @@ class WarmStart(BaseAlgorithm):
     def _pretrain(self, stage: Pretraining) -> None:
         """A method's own part of the offline stage."""
 
-    def offline_stage(self, progress_bar: bool = False, trunk: Payload | None = None) -> Pretraining:
-        """The offline stage of the clients that live here; nothing is computed yet. ``trunk`` as in :meth:`pretrain`."""
+    def offline_stage(
+        self, progress_bar: bool = False, trunk: Payload | None = None, progress: Progress | None = None
+    ) -> Pretraining:
+        """The offline stage of the clients that live here; nothing is computed yet. Parameters as in :meth:`pretrain`."""
         assert self.seed is not None
         return Pretraining(
             self.family,
@@ -49,6 +52,7 @@ class WarmStart(BaseAlgorithm):
             seed=self.seed,
             cache_dir=self.cache_dir,
             progress_bar=progress_bar,
+            progress=progress,
             env_spaces=(self.observation_space, self.action_space),
             trunk=trunk,
         )
@@ -63,17 +67,18 @@ class WarmStart(BaseAlgorithm):
             remedy = "" if self.uses_prior else "; or leave behaviour cloning out with bc_weight=0 (-params bc_weight:0)"
             raise ValueError(f"{type(self).__name__} begins with an offline stage: {error}{remedy}") from None
 
-    def pretrain(self, progress_bar: bool = False, trunk: Payload | None = None) -> None:
+    def pretrain(self, progress_bar: bool = False, trunk: Payload | None = None, progress: Progress | None = None) -> None:
         """The offline stage: behaviour cloning and whatever the method needs; results are cached. Runs at most once.
 
         :param trunk: the priors' trunk where a server has trained it
             (:meth:`sb3_fedguide.server.trunk.TrunkAverages.payload`); otherwise it is trained here, on all clients' data
+        :param progress: called as the stage goes on, instead of a bar for each piece
         :raises ValueError: where the method needs offline data and none can be had
         """
         if self.pretrained:
             return
         self.check_offline_data()
-        stage = self.offline_stage(progress_bar, trunk)
+        stage = self.offline_stage(progress_bar, trunk, progress)
         if self.bc_weight > 0:
             self._initialize_from_behavior_cloning(stage)
         self._pretrain(stage)

@@ -70,6 +70,21 @@ def read_evaluations(client: int, facts: Mapping[str, Any]) -> list[ClientEvalua
     return found
 
 
+def count_tests(facts: Mapping[int, Mapping[str, Any]], counted: dict[int, int]) -> int:
+    """The environment steps of tests that clients report and that are not in ``counted``, where they are now.
+
+    :param facts: each client's, with its ``test_steps`` since the beginning; what is no number of steps counts for nothing
+    :param counted: steps of tests by client
+    """
+    new = 0
+    for client, own in facts.items():
+        steps = own.get("test_steps")
+        if type(steps) is int and counted.get(client, 0) < steps < 2**53:
+            new += steps - counted.get(client, 0)
+            counted[client] = steps
+    return new
+
+
 def merge_figures(facts: Mapping[int, Mapping[str, Any]]) -> dict[str, float]:
     """One log of all clients': ``client_<k>/...`` is taken from client k, everything else averaged over those that say it.
 

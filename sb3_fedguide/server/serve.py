@@ -17,7 +17,7 @@ from sb3_fedguide.common.checkpoint_files import newest_checkpoint, remove_lefto
 from sb3_fedguide.server.build import make_strategy
 from sb3_fedguide.server.clients import OF_A_RUN, Clients, difference, server_facts
 from sb3_fedguide.server.config import ServerConfig
-from sb3_fedguide.server.figures import EvaluationTable, evaluation_figures, merge_figures, read_evaluations
+from sb3_fedguide.server.figures import EvaluationTable, count_tests, evaluation_figures, merge_figures, read_evaluations
 from sb3_fedguide.server.payload import Payload
 from sb3_fedguide.server.rounds import Rounds, participants, payload_bytes
 from sb3_fedguide.server.transport import RUN, UNPREPARED, Failure, Kind, Message, Transport
@@ -26,7 +26,7 @@ from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_
 logger = logging.getLogger(__name__)
 
 #: What of the server a checkpoint holds as it is.
-_ATTRIBUTES = ("run_id", "round", "timesteps", "n_broadcasts", "n_setups", "outbox", "finished", "told")
+_ATTRIBUTES = ("run_id", "round", "timesteps", "test_steps", "n_broadcasts", "n_setups", "outbox", "finished", "told")
 __all__ = ["Server", "ServerConfig", "TooFewClients", "serve"]
 
 CHECKPOINTS = "checkpoints"
@@ -81,8 +81,9 @@ class Server:
         self.trunk: TrunkAverages | None = None
         #: complete rounds
         self.round = 0
-        #: environment steps of all clients together, after each round
+        #: environment steps of all clients together, tests included, after each round; and those of tests by client
         self.timesteps: list[int] = []
+        self.test_steps: dict[int, int] = {}
         #: exchanges in which clients received something
         self.n_broadcasts = 0
         #: tells this run from others with the same settings
@@ -215,8 +216,9 @@ class Server:
             return self._to_prepared("round", round, chosen) | waiting
 
         replies = self._collect(requests, config.timeout)
-        figures = merge_figures({client: reply.facts for client, reply in replies.items()})
-        self.timesteps.append(config.rollout_size * len(replies) + (self.timesteps[-1] if self.timesteps else 0))
+        facts = {client: reply.facts for client, reply in replies.items()}
+        figures, earlier = merge_figures(facts), self.timesteps[-1] if self.timesteps else 0
+        self.timesteps.append(earlier + config.rollout_size * len(replies) + count_tests(facts, self.test_steps))
         exchanged = time.perf_counter()
         self._aggregate(round, replies)
         self.round = round

@@ -1,0 +1,219 @@
+"""The plot command: figures of a benchmark's results, or of runs from their folders, as PNG and PDF."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sb3_fedguide.algorithms import ALGORITHMS
+from sb3_fedguide.cli.arguments import OneLineParser
+from sb3_fedguide.cli.benchmark_arguments import benchmark_parser, check_methods, parse_benchmark
+from sb3_fedguide.cli.names import check_names
+from sb3_fedguide.cli.output import pipe_may_close
+from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, one_message
+from sb3_fedguide.cli.train import import_packages
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from fed_envs import Family
+    from sb3_fedguide.benchmark.figures.runs import Comparison
+
+#: Flags that mean the same as for ``fedguide benchmark``.
+SHARED = ("algos", "envs", "metadata", "seeds", "folder", "baseline", "gym_packages")
+#: Those that choose results of a benchmark, so that they say nothing about run folders.
+OF_BENCHMARK = ("algos", "metadata", "seeds", "label")
+FIGURES = ("curves", "bars", "clients", "aggregate", "speedup")
+#: Flags of the learning curves, and what they are by default.
+OF_CURVES = {"x": "rounds", "of": "average", "band": "range"}
+
+Drawn = list[tuple[str, "Figure"]]
+
+
+@pipe_may_close
+def main(argv: Sequence[str] | None = None, prog: str = "fedguide plot") -> int:
+    """Run the command.
+
+    :return: the exit code: 0, 1 where a file could not be written, 2 for wrong input
+    """
+    arguments = _parse(argv, prog)
+    try:
+        _check(arguments)
+        figures, left_out = _draw_all(arguments, *_read(arguments, prog))
+    except (ValueError, OSError) as error:
+        print(f"{prog}: error: {' '.join(one_message(error).split())}", file=sys.stderr)
+        return EXIT_USAGE
+    from sb3_fedguide.benchmark.figures.layout import save
+
+    try:
+        Path(arguments.output).mkdir(parents=True, exist_ok=True)
+        for name, figure in figures:
+            print("wrote", " ".join(map(str, save(figure, Path(arguments.output), name))))
+    except OSError as error:
+        print(f"{prog}: error: {one_message(error)}", file=sys.stderr)
+        return EXIT_FAILED
+    for reason in left_out:
+        print(f"{prog}: {reason}", file=sys.stderr)
+    return 0
+
+
+def _parse(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
+    parser = OneLineParser(
+        prog=prog,
+        allow_abbrev=False,
+        description="Draw figures of a benchmark's results (--envs), or of runs from their folders, as PNG and PDF.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    flag = parser.add_argument
+    flag("runs", nargs="*", default=[], metavar="RUN", help="folders of runs, finished or not, e.g. logs/*/HopperHard_1, "
+         "instead of --envs")  # fmt: skip
+    for action in benchmark_parser(prog)._actions:
+        if action.dest in SHARED:
+            parser._add_action(action)
+    flag("--label", nargs="+", metavar="LABEL", help="names of the results; by default tuned; with several, methods are "
+         "called by their name and label")  # fmt: skip
+    flag("--figures", nargs="+", metavar="FIGURE", help=f"{', '.join(FIGURES)}; by default all that the data allow")
+    flag("-x", choices=("rounds", "steps", "seconds", "bytes"), help="what learning curves are drawn over; by default rounds")
+    flag("--of", choices=("average", "worst", "clients"), help="what learning curves show: the clients' average (default), "
+         "the worst client, or each client in a panel of its own")  # fmt: skip
+    flag("--band", choices=("range", "bootstrap"), help="of learning curves: from the lowest to the highest seed (default), "
+         "or the 95 %% bootstrap interval of the mean over seeds")  # fmt: skip
+    flag("-o", "--output", default="figures", metavar="DIR", help="folder to write to")
+    for action in parser._actions:
+        if action.dest in ("seeds", "folder", "baseline"):
+            action.help = {
+                "seeds": "by default all that there are",
+                "folder": "results are in DIR/FAMILY-LABEL/ALGO-seedN.json",
+                "baseline": "method to compare with: its mean return scores 1, and is what counts for the speed-up",
+            }[action.dest]
+    return parser.parse_strictly(argv)
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """:raises ValueError: for what the flags alone show to be wrong"""
+    from sb3_fedguide.cli.run_folder import check_log_folder
+
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ValueError("drawing needs matplotlib, which is not installed; install it with 'pip install matplotlib'")
+    if not arguments.runs and not arguments.envs and not arguments.metadata:
+        raise ValueError("give folders of runs, or the families of a benchmark's results with --envs FAMILY ...")
+    if arguments.runs and arguments.envs:
+        raise ValueError("give folders of runs or --envs, not both")
+    if arguments.runs and (given := [name for name in OF_BENCHMARK if getattr(arguments, name)]):
+        raise ValueError(f"--{given[0]} chooses results of a benchmark (--envs); with folders of runs, leave it out")
+    check_names(arguments.figures or (), FIGURES, "figure")
+    given = [name for name in OF_CURVES if getattr(arguments, name) is not None]
+    if given and arguments.figures and "curves" not in arguments.figures:
+        raise ValueError(f"-{'' if given[0] == 'x' else '-'}{given[0]} is for learning curves; add curves to --figures")
+    if len(set(arguments.label or ())) < len(arguments.label or ()):
+        raise ValueError("--label names the same results twice")
+    check_log_folder(Path(arguments.output), "output folder", "-o")
+
+
+def _read(arguments: argparse.Namespace, prog: str) -> tuple[Comparison, Callable[[str], float]]:
+    """The runs, and what random actions return on a family.
+
+    :raises ValueError: for anything that a user can put right
+    """
+    import_packages(arguments.gym_packages)
+    if arguments.runs:
+        from sb3_fedguide.cli.plot_runs import read_run_folders
+
+        comparison = read_run_folders(arguments.runs)
+        methods = [name for runs in comparison.values() for name in runs]
+        check_names([arguments.baseline], dict.fromkeys([*ALGORITHMS, *methods]), "algorithm")
+        return comparison, lambda family: _random_of(next(iter(comparison[family].values()))[0].source)
+    labels = arguments.label or ["tuned"]
+    parsed = [parse_benchmark(_benchmark_flags(arguments, label), prog) for label in labels]
+    check_methods(parsed[0])
+    from sb3_fedguide.cli.benchmark import find_families, random_level
+    from sb3_fedguide.cli.plot_runs import read_benchmark
+
+    families: Mapping[str, Family] = find_families(parsed[0], prog)
+    comparison = read_benchmark(parsed[0], families, labels)
+    return comparison, lambda family: random_level(Path(arguments.folder), families[family])
+
+
+def _random_of(folder: Path) -> float:
+    import fed_envs
+    from sb3_fedguide.benchmark.aggregate import random_actions
+
+    return random_actions(fed_envs.load_family((folder / "metadata.json").absolute())).average
+
+
+def _benchmark_flags(arguments: argparse.Namespace, label: str) -> list[str]:
+    """What ``fedguide benchmark`` is to be given for the same results: its checks are ours."""
+    flags = ["--table-only", f"--label={label}"]
+    for name in SHARED:
+        value = getattr(arguments, name)
+        if value:
+            flags += [f"--{name.replace('_', '-')}", *(map(str, value) if isinstance(value, list) else [str(value)])]
+    return flags
+
+
+def _draw_all(
+    arguments: argparse.Namespace, comparison: Comparison, random: Callable[[str], float]
+) -> tuple[Drawn, list[str]]:
+    """Every figure that is asked for, or that the data allow; and why the others are left out.
+
+    :raises ValueError: where a figure that is asked for cannot be drawn, or none can
+    """
+    asked = set(arguments.figures or ())
+    if any(getattr(arguments, name) is not None for name in OF_CURVES):
+        asked.add("curves")  # its flags ask for it
+    for name, default in OF_CURVES.items():
+        if getattr(arguments, name) is None:
+            setattr(arguments, name, default)
+    drawn: Drawn = []
+    left_out = [f"{run.source} is not finished, and is drawn in learning curves only"
+                for runs in comparison.values() for group in runs.values() for run in group if run.result is None]  # fmt: skip
+    for figure in arguments.figures or FIGURES:
+        try:
+            drawn += _draw(figure, arguments, comparison, random, left_out)
+        except ValueError as error:
+            if figure in asked:
+                raise ValueError(f"{figure}: {error}") from None
+            left_out.append(f"left out {figure}: {error}")
+    if not drawn:
+        raise ValueError(f"there is nothing to draw: {'; '.join(left_out)}")
+    return drawn, left_out
+
+
+def _draw(
+    figure: str, arguments: argparse.Namespace, comparison: Comparison, random: Callable[[str], float], notes: list[str]
+) -> Drawn:
+    """:param notes: takes what is to be said about the figure"""
+    from sb3_fedguide.benchmark.figures import bars, clients, curves
+
+    if figure == "curves":
+        name = f"curves-{arguments.of}-{arguments.x}"
+        if arguments.of != "clients":
+            return [(name, curves.draw_curves(comparison, arguments.of, arguments.x, arguments.band))]
+        return [
+            (f"{name}-{_file_name(family)}", curves.draw_client_curves(family, runs, arguments.x, arguments.band))
+            for family, runs in comparison.items()
+        ]
+    if figure == "bars":
+        return [("bars", bars.draw_bars(comparison))]
+    if figure == "clients":
+        return [(f"clients-{_file_name(family)}", clients.draw_clients(family, runs)) for family, runs in comparison.items()]
+    if figure == "speedup":
+        return [("speedup", bars.draw_speed_up(comparison, arguments.baseline))]
+    if len(comparison) < 2:
+        raise ValueError("it needs finished runs on several families")
+    from sb3_fedguide.benchmark.figures import aggregates  # PyTorch comes with it
+
+    complete = aggregates.complete_methods(comparison, arguments.baseline)  # before random actions are measured
+    if partial := sorted({name for runs in comparison.values() for name in runs} - set(complete)):
+        notes.append(f"aggregate is without {', '.join(partial)}: some families have no finished run")
+    return [("aggregate", aggregates.draw_aggregate(comparison, {family: random(family) for family in comparison},
+                                                    arguments.baseline))]  # fmt: skip
+
+
+def _file_name(family: str) -> str:
+    return re.sub(r"[^\w.+=-]+", "_", family).lstrip(".") or "family"
