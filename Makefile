@@ -7,10 +7,11 @@ RUNTIME := $(VENV)/.runtime-installed
 TOOLS := $(VENV)/.tools-installed
 FLOWER := $(VENV)/.flower-installed
 RAY := $(VENV)/.ray-installed
+SITE := $(VENV)/.site-installed
 # Small networks gain nothing from threads, and threads of several libraries get into each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help install train demo test test-slow test-flower test-flower-slow test-ray lint type format clean
+.PHONY: help install train demo test test-slow test-flower test-flower-slow test-ray lint type docs format clean
 
 help:
 	@echo "make train      install, then FedGuide on HopperHard, end to end"
@@ -20,6 +21,7 @@ help:
 	@echo "make test-flower test-flower-slow  deployments over Flower, with real processes; installs Flower"
 	@echo "make test-ray   training and benchmarks on two Ray nodes; installs Ray"
 	@echo "make lint type  ruff, mypy"
+	@echo "make docs       these pages as a site, build/docs/index.html; warnings are errors; installs Sphinx"
 	@echo "make format     rewrite the code with ruff"
 	@echo "make clean      remove caches and builds; runs, logs and the environment stay"
 
@@ -50,6 +52,10 @@ lint: $(TOOLS)
 
 type: $(TOOLS)
 	$(BIN)/python -m mypy
+
+docs: $(SITE)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs $(ARGS)
+	@echo "build/docs/index.html"
 
 format: $(TOOLS)
 	$(BIN)/python -m ruff check --fix .
@@ -82,10 +88,14 @@ $(RAY): $(RUNTIME)
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[ray]'
 	@touch $@
 
+$(SITE): $(RUNTIME)
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[docs]'
+	@touch $@
+
 $(FLOWER): $(RUNTIME)
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[flower]'
 	@touch $@
 
 clean:
-	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf build dist docs/families *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

@@ -1,0 +1,261 @@
+"""The documentation says what the code does: examples run, command lines parse, every method and family has its page."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+from pathlib import Path
+from types import ModuleType
+
+import gymnasium as gym
+import pytest
+
+from fed_envs import FAMILIES, load_family
+from sb3_fedguide.algorithms import ALGORITHMS, algorithm
+from sb3_fedguide.cli import benchmark_arguments, deploy, evaluate, export
+from sb3_fedguide.cli.arguments import parse_train, train_parser
+from sb3_fedguide.cli.config import parse_params, resolve
+from sb3_fedguide.cli.main import USAGE
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("*.md"), *(DOCS / "algorithms").glob("*.md")])
+#: Pages all of whose Python examples are complete programs that take a moment.
+PROGRAMS = [DOCS / name for name in ("first_federation.md", "how_to.md", "comparison.md")]
+ACTIONS = {
+    "Box": gym.spaces.Box(-1.0, 1.0, (2,)),
+    "Discrete": gym.spaces.Discrete(3),
+    "MultiDiscrete": gym.spaces.MultiDiscrete([2, 3]),
+    "MultiBinary": gym.spaces.MultiBinary(2),
+}
+
+
+def _load_pages() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("docs_pages", DOCS / "pages.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def pages() -> ModuleType:
+    return _load_pages()
+
+
+@pytest.fixture(scope="module")
+def families(pages: ModuleType) -> dict[str, str]:
+    """The families' pages as the site makes them."""
+    return pages.family_pages()
+
+
+def blocks(text: str, language: str) -> list[str]:
+    """What stands between fences of a language, ``""`` for commands."""
+    fences = re.findall(r"^```([^\n]*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return [body for tag, body in fences if tag.strip() == language]
+
+
+def commands(text: str) -> list[list[str]]:
+    """The command lines of this package in a page, in words, without comments."""
+    found = []
+    for block in blocks(text, ""):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = (
+                shlex.split(line.removeprefix("$ "), comments=True)
+                if "#" in line or "fedguide" in line or "py" in line
+                else []
+            )
+            words = words[1:] if words[:1] and words[0].endswith("/python") else words
+            words = ["fedguide", *words[1:]] if words[:1] and words[0].endswith("/bin/fedguide") else words
+            words = ["python", *words[1:]] if words[:1] == ["python3"] else words
+            if words[:1] == ["fedguide"] or words[:1] == ["python"]:
+                found.append([word for word in words if word not in ("[...]",)])
+    return found
+
+
+def check_command(words: list[str]) -> None:
+    """Parse a command line, and resolve the hyperparameters that it asks for.
+
+    :raises SystemExit: where a parser refuses it
+    """
+    program, *arguments = words
+    if program == "python":
+        if arguments[0] == "-m" and arguments[1] == "fed_envs.metadata":
+            from fed_envs.metadata_command import _parser
+
+            _parser().parse_args(arguments[2:])
+            return
+        assert (DOCS / "examples" / arguments[0]).exists() or (ROOT / arguments[0]).exists(), f"there is no {arguments[0]}"
+        if not arguments[0].endswith("train.py"):
+            return
+        command, arguments = "train", arguments[1:]
+    else:
+        command, *arguments = arguments
+    if arguments[-1:] == ["--help"] or command == "--version":
+        return
+    assert re.search(rf"^  {command} ", USAGE, re.MULTILINE), f"fedguide has no command {command}"
+    if command == "train":
+        options = parse_train(arguments, "train.py")
+        if options.env in FAMILIES and options.algo in ALGORITHMS and options.conf_file in ("tuned", "paper"):
+            resolve(options.algo, load_family(options.env), options.conf_file, overrides=parse_params(options.hyperparams))
+    elif command == "benchmark":
+        options = benchmark_arguments.parse_benchmark(arguments, "fedguide benchmark")
+        for name in set(options.algos or ()) & set(ALGORITHMS):
+            resolve(name, load_family(options.envs[0]), overrides=parse_params(options.hyperparams))
+    elif command in ("evaluate", "export"):
+        {"evaluate": evaluate, "export": export}[command]._parser(command).parse_strictly(arguments)
+    elif command == "deploy":
+        deploy._parser().parse_strictly(arguments)
+    elif command == "dataset":
+        from sb3_fedguide.cli import dataset
+        from sb3_fedguide.offline.make_dataset import COLUMNS
+
+        dataset._parser(command, COLUMNS).parse_strictly(arguments)
+
+
+def test_every_method_has_its_page():
+    assert {path.stem for path in (DOCS / "algorithms").glob("*.md")} == {*ALGORITHMS, "index"}
+    index = (DOCS / "algorithms" / "index.md").read_text()
+    for name in ALGORITHMS:
+        page = (DOCS / "algorithms" / f"{name}.md").read_text()
+        headings = re.findall(r"^## (.+)$", page, re.MULTILINE)
+        assert headings == [
+            "Notes", "Can I use?", "Example", "Results", "How to replicate", "Parameters", "Differences to the original",
+        ], name  # fmt: skip
+        assert f"<!-- results of {name} -->" in page and f"<!-- parameters of {name} -->" in page
+        assert f".. autoclass:: sb3_fedguide.{ALGORITHMS[name][1]}\n" in page
+        assert f"]({name}.md) | `{name}` |" in index and re.search(rf"^{re.escape(name)}$", index, re.MULTILINE)
+
+
+def test_every_family_has_its_page(families):
+    assert set(families) == {f"{name}.md" for name in FAMILIES} | {"index.md"}
+    for name in FAMILIES:
+        family, page = load_family(name), families[f"{name}.md"]
+        assert family.description in page and family.content_hash[:16] in page
+        for field in family.clients[0].parameters():
+            assert f"`{field}`" in page
+        assert f"]({name}.md)" in families["index.md"]
+
+
+def test_a_pages_parameters_are_the_constructors(pages):
+    from sb3_fedguide.cli.schema import hyperparameters
+
+    for name in ALGORITHMS:
+        cls = algorithm(name)
+        tables = dict(re.findall(r"^\| `(\w+)` \| (.*?) \| ", pages.parameter_tables(name), re.MULTILINE))
+        documented = {*pages._own_parameters(cls), *tables}
+        for parameter, (_, default) in hyperparameters(cls).items():
+            if parameter not in documented:  # explained beside another: "like `clip_range_vf`"
+                assert f"`{parameter}`" in pages.parameter_tables(name), f"{name}: {parameter}"
+            elif parameter in tables:
+                assert tables[parameter] in (f"`{default!r}`", ""), f"{name}: {parameter}"
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_the_example_of_a_method_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (example,) = blocks((DOCS / "algorithms" / f"{name}.md").read_text(), "python")
+    exec(compile(example, f"{name}.md", "exec"), {"__name__": name})
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_method_takes_the_actions_that_its_page_names(name):
+    page = (DOCS / "algorithms" / f"{name}.md").read_text()
+    (row,) = re.findall(r"^\| actions \| (.*) \|$", page, re.MULTILINE)
+    named = set(re.findall(r"`(\w+)`", row))
+    taken = set()
+    for kind, space in ACTIONS.items():
+
+        class Env(gym.Env):
+            observation_space, action_space = gym.spaces.Box(-1.0, 1.0, (3,)), space
+
+            def reset(self, *, seed=None, options=None):
+                super().reset(seed=seed)
+                return self.observation_space.sample(), {}
+
+            def step(self, action):
+                return self.observation_space.sample(), 0.0, False, True, {}
+
+        try:
+            algorithm(name)("MlpPolicy", [Env, Env], rollout_size=8, batch_size=4)
+        except ValueError:
+            continue
+        taken.add(kind)
+    assert named == taken
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_the_example_of_a_family_runs(name, families):
+    (example,) = blocks(families[f"{name}.md"], "python")
+    exec(compile(example, f"{name}.md", "exec"), {"__name__": name})
+
+
+@pytest.mark.parametrize("page", PROGRAMS, ids=lambda page: page.name)
+def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for number, example in enumerate(blocks(page.read_text(), "python")):
+        exec(compile(example, f"{page.name}, example {number}", "exec"), {"__name__": "example"})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_examples_are_python(page):
+    for example in blocks(page.read_text(), "python"):
+        compile(example, page.name, "exec")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_command_lines_are_understood(page):
+    for words in commands(page.read_text()):
+        _check(words)
+
+
+def test_command_lines_of_families_are_understood(families):
+    for page in families.values():
+        for words in commands(page):
+            _check(words)
+
+
+def _check(words: list[str]) -> None:
+    try:
+        check_command(words)
+    except SystemExit as refusal:
+        if refusal.code:
+            pytest.fail(f"refused: {shlex.join(words)}")
+
+
+def test_a_wrong_command_line_is_found():
+    text = "```\npython train.py --algo fedavg --env HopperHard --round 3\n```\n"
+    with pytest.raises(SystemExit):
+        check_command(*commands(text))
+    with pytest.raises(ValueError, match="no_such"):
+        check_command(*commands("```\npython train.py --env HopperHard -params no_such:1\n```\n"))
+
+
+def test_links_between_pages_lead_somewhere(pages):
+    for page in PAGES:
+        text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+        for target in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text):
+            path, _, anchor = target.partition("#")
+            file = (page.parent / path).resolve() if path else page
+            if file.parent == DOCS / "families":  # made by the site
+                assert file.stem in (*FAMILIES, "index"), f"{page.name}: {target}"
+                continue
+            assert file.exists(), f"{page.name}: {target}"
+            if anchor:
+                headings = re.findall(r"^#+ (.+)$", file.read_text(), re.MULTILINE)
+                assert anchor in map(pages.slug, headings), f"{page.name}: {target}"
+
+
+def test_the_site_has_every_page():
+    index = (DOCS / "index.md").read_text()
+    for page in DOCS.glob("*.md"):
+        if page.name != "index.md":
+            assert re.search(rf"^(.* <)?{page.stem}>?$", index, re.MULTILINE), f"{page.name} is in no toctree of index.md"
+
+
+def test_all_flags_of_training_are_documented():
+    text = (DOCS / "command_line.md").read_text()
+    for action in train_parser("")._actions:
+        if action.dest != "help":
+            assert any(f"`{option}" in text or f" {option}" in text for option in action.option_strings), action.dest
