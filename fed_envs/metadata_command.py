@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from fed_envs.generation import generate_family
 from fed_envs.metadata import Family, load_family
@@ -24,6 +25,9 @@ def _parser() -> argparse.ArgumentParser:
     for name, text in (("show", "print a family's clients as a table"), ("validate", "check metadata files")):
         command = commands.add_parser(name, help=text)
         command.add_argument("families", nargs="+", metavar="FILE", help="metadata files, or names of shipped families")
+    plot = commands.add_parser("plot", help="draw how clients differ, and how far a Hard family reaches beyond its main one")
+    plot.add_argument("families", nargs="+", metavar="FILE", help="metadata files, or names of shipped families")
+    plot.add_argument("-o", "--output", metavar="DIR", default="figures", help="folder of the pictures (default: figures)")
     return parser
 
 
@@ -43,6 +47,26 @@ def table(family: Family) -> str:
     return "\n".join([head, family.description, f"content hash {family.content_hash}", "", *lines])
 
 
+def _plot(families: Sequence[Family], folder: Path) -> None:
+    """Write each family's heat map, and the ranges of every main family beside its Hard one, as PNG and PDF."""
+    from fed_envs import metadata_figures
+
+    figures = {f"heterogeneity-{family.name}": metadata_figures.heterogeneity(family) for family in families}
+    shown = {family.name: family for family in families}
+    for name in dict.fromkeys(family.name.removesuffix("Hard") for family in families):
+        pair = [shown.get(own) or load_family(own) for own in (name, f"{name}Hard") if own in shown or own in FAMILIES]
+        if len(pair) == 2:
+            figures[f"ranges-{name}"] = metadata_figures.ranges(pair)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in figures.items():
+        if figure is None:
+            print(f"left out {name}: no number differs between the clients")
+            continue
+        for kind in ("png", "pdf"):
+            figure.savefig(folder / f"{name}.{kind}", dpi=180)
+        print(f"{folder / name}.png, .pdf")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; errors are one message on stderr and exit code 2, as argparse has it."""
     options = _parser().parse_args(arguments)
@@ -54,6 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             else:
                 family.dump(options.output)
                 print(f"{options.output}: {family.name}, {family.n_clients} clients")
+        elif options.command == "plot":
+            _plot([load_family(source) for source in options.families], Path(options.output))
         else:
             for number, source in enumerate(options.families):
                 family = load_family(source)

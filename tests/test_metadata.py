@@ -17,6 +17,7 @@ from fed_envs import clients, metadata
 from fed_envs.generation import PAPER_SEEDS, generate_family
 from fed_envs.metadata import Family, load_family, parse_family, read_family
 from fed_envs.metadata_command import main
+from fed_envs.metadata_figures import ranges, varying_parameters
 from fed_envs.registration import METADATA_FOLDER
 
 # SHA-256 of the paper's figures, client by client: canonical JSON of the list of clients, numbers as floats.
@@ -360,3 +361,26 @@ def test_command_runs_as_a_module(tmp_path):
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env={**os.environ, "PYTHONWARNINGS": ""})
     assert result.returncode == 2
     assert "broken.json: client 3" in result.stderr and "Traceback" not in result.stderr
+
+
+def test_plot_draws_a_familys_clients_and_how_far_its_hard_one_reaches(tmp_path, capsys):
+    assert main(["plot", "Hopper", "MetaWorld10", "-o", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "left out heterogeneity-MetaWorld10" in said and "ranges-Hopper.png" in said
+    names = {f"{name}.{kind}" for name in ("heterogeneity-Hopper", "ranges-Hopper") for kind in ("png", "pdf")}
+    assert {path.name for path in tmp_path.iterdir()} == names
+    assert all(path.stat().st_size > 5000 for path in tmp_path.iterdir())
+    assert main(["plot", "Hoper", "-o", str(tmp_path / "none")]) == 2 and not (tmp_path / "none").exists()
+
+
+def test_ranges_have_a_panel_for_each_number_and_a_dot_for_each_client():
+    families = [load_family("Hopper"), load_family("HopperHard")]
+    figure = ranges(families)
+    names = list(dict.fromkeys(name for family in families for name in varying_parameters(family.clients)[0]))
+    panels = {axes.get_title(): axes for axes in figure.axes if axes.get_title()}
+    assert list(panels) == [name.replace("_", " ") for name in names]
+    for place, family in enumerate(families):
+        drawn = panels["mass scale"].get_lines()[place].get_ydata()
+        assert drawn.tolist() == [client.mass_scale for client in family.clients]
+    with pytest.raises(ValueError, match="Hopper, Reacher are not of one world"):
+        ranges([load_family("Hopper"), load_family("Reacher")])

@@ -17,6 +17,7 @@ from tensorboard.plugins.hparams import metadata
 import fed_envs
 from fed_envs import FederatedVecEnv
 from fed_envs.generation import generate_family
+from fed_envs.metadata_figures import varying_parameters
 from sb3_fedguide import FedAvg, FedGuide, FedGuideA, FedRL, Local
 from sb3_fedguide.benchmark.bandit2d import Policies
 from sb3_fedguide.cli.main import main
@@ -170,15 +171,15 @@ def test_pictures_of_many_clients_are_as_large_as_those_of_fifty():
 
 
 def test_parameters_that_differ_are_found():
-    names, values = pictures.varying_parameters(fed_envs.load_family("Bandit2D").clients)
+    names, values = varying_parameters(fed_envs.load_family("Bandit2D").clients)
     assert names == ["peak 0", "peak 1"]
     np.testing.assert_array_equal(values, [[1, 0], [0, 1], [-1, 0], [0, -1]])
     reacher = fed_envs.load_family("Reacher")
-    names, values = pictures.varying_parameters(reacher.clients)
+    names, values = varying_parameters(reacher.clients)
     assert names == ["goal_angle_deg", "goal_x 0", "goal_x 1", "goal_y 0", "goal_y 1", "action_offset 0", "action_offset 1",
                      "reward_scale", "angle_offset"]  # fmt: skip
     assert values[1, 7] == reacher.client(1).reward_scale
-    same, empty = pictures.varying_parameters(reacher.with_parameters(reward_scale=1.0).clients[:1])
+    same, empty = varying_parameters(reacher.with_parameters(reward_scale=1.0).clients[:1])
     assert same == [] and empty.shape == (1, 0)
 
 
