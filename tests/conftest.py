@@ -115,3 +115,12 @@ def keys(certificates: Path) -> Path:
     for name in ("a", "b"):
         assert main(["deploy", "key", str(folder), name]) == 0
     return folder
+
+
+@pytest.fixture
+def coarse_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small pictures, and no PDFs, whose fonts take long: both again where a test is about them."""
+    from sb3_fedguide.benchmark.figures import layout
+
+    monkeypatch.setattr(layout, "DPI", 60)
+    monkeypatch.setattr(layout, "FORMATS", ("png",))

@@ -34,6 +34,7 @@ class Deployment:
     :param algo: command-line name
     :param params: hyperparameters
     :param env: family, of which there are the first ``n_clients`` clients
+    :param family: its metadata instead of those that ship with the package
     :param host: by which clients know the server
     :param variables: of every process's environment
     :param server: further lines of the server's configuration
@@ -41,12 +42,13 @@ class Deployment:
 
     def __init__(
         self, folder: Path, algo: str, n_rounds: int, params: Mapping[str, Any] = SMALL, env: str = "Bandit2D",
-        n_clients: int = 3, host: str = "localhost", variables: Mapping[str, str] | None = None, **server: Any,
+        n_clients: int = 3, host: str = "localhost", variables: Mapping[str, str] | None = None,
+        family: Mapping[str, Any] | None = None, **server: Any,
     ) -> None:  # fmt: skip
         self.folder, self.n_clients, self._variables = folder, n_clients, dict(variables or {})
         self.common = {"algo": algo, "seed": 0, "n_rounds": n_rounds, "params": dict(params)}
         self.metadata = folder / f"{env}.json"
-        family = json.loads(fed_envs.FAMILIES[env].read_text())
+        family = json.loads(fed_envs.FAMILIES[env].read_text()) if family is None else family
         self.metadata.write_text(json.dumps({**family, "clients": family["clients"][:n_clients]}))
         self._mark = uuid.uuid4().hex
         self._processes: dict[str, subprocess.Popen[bytes]] = {}

@@ -21,6 +21,7 @@ from sb3_fedguide.cli.benchmark import differences, main, make_plan
 from sb3_fedguide.cli.benchmark_arguments import parse_benchmark
 from sb3_fedguide.cli.run_folder import exclusive
 from sb3_fedguide.cli.train import main as train
+from tests.result_files import summary, write_result
 
 ROOT = Path(__file__).parents[1]
 #: Stands for the training command: begins a run's folder, then does what the environment says about its seed.
@@ -52,27 +53,6 @@ summary.update(algo=folder.parent.name, seed=seed)
 summary["deployed"]["average"] = 10.0 + seed
 (folder / "summary.json").write_text(json.dumps(summary))
 """
-
-
-def summary(**changes) -> dict:
-    """What a result file holds; ``curve`` goes into ``deployed``."""
-    deployed = {"average": 1.0, "worst_client": 0.5, "n_episodes": 3, "success_rates": None, "curve": [[1, 2.0], [2, 4.0]]}
-    optional = ("client_returns", "client_curve")
-    deployed.update({name: changes.pop(name) for name in list(changes) if name in deployed or name in optional})
-    content = {
-        "algo": "local", "env": "Bandit2D", "conf_file": "tuned", "n_rounds": 3, "seed": 0, "rounds_done": 3, "finished": True,
-        "metadata_hash": fed_envs.load_family("Bandit2D").content_hash, "bytes_up": 6000, "bytes_down": 3_000_000,
-        "seconds": {"median_round": 0.5, "total": 7.0}, "deployed": deployed,
-    }  # fmt: skip
-    return {**content, **changes}
-
-
-def write_result(folder: Path, label: str = "tuned", **changes) -> Path:
-    content = summary(**changes)
-    path = folder / f"{content['env']}-{label}" / f"{content['algo']}-seed{content['seed']}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content))
-    return path
 
 
 @pytest.fixture

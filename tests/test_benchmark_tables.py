@@ -15,7 +15,7 @@ from sb3_fedguide.benchmark.aggregate import aggregate, bootstrap_interval, inte
 from sb3_fedguide.benchmark.results import best_known, measure, read_result, read_results, volatility
 from sb3_fedguide.cli.benchmark import main
 from sb3_fedguide.cli.benchmark_tables import fitting, rows_of
-from tests.test_benchmark_command import write_result
+from tests.result_files import write_result
 
 ROOT = Path(__file__).parents[1]
 

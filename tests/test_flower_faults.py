@@ -14,6 +14,7 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.flower_deployment import SMALL, Deployment
@@ -40,6 +41,23 @@ def test_same_as_in_process(tmp_path: Path, algo: str, env: str, params: dict) -
         deployment.start_all()
         assert deployment.exit_codes() == [0, 0, 0, 0]
         assert_same(deployment)
+
+
+def test_registered_environments_of_ones_own_are_deployed(tmp_path: Path) -> None:
+    """Pendulums of the Gymnasium package give no state, so that their episodes begin anew with every round, and it is said."""
+    clients = [{"client": k, "id": "Pendulum-v1", "kwargs": {"g": 9.0 + k}} for k in range(2)]
+    family = {"schema_version": 1, "family": "Pendulums", "world": "gymnasium", "backbone": "Gymnasium",
+              "max_episode_steps": 16, "description": "", "clients": clients}  # fmt: skip
+    params = {**SMALL, "bc_weight": 0.0, "pretraining": {}, "mix": 1.0}
+    with Deployment(tmp_path, "fedavg", 2, params, "Gymnasium", 2, family=family, min_clients=2, timeout=300) as deployment:
+        deployment.start_all()
+        assert deployment.exit_codes() == [0, 0, 0]
+        assert "their episodes began anew" in deployment.log("client_0")
+        first, second = ({name: array for name, array in deployment.parameters(k).items() if name.startswith("policy")}
+                         for k in range(2))  # fmt: skip
+        assert first.keys() == second.keys() and len(first) > 5
+        for name, array in first.items():  # after the last average they have the same policy
+            assert np.isfinite(array).all() and np.array_equal(array, second[name]), name
 
 
 def test_slow_raising_and_lying_clients(tmp_path: Path) -> None:

@@ -12,11 +12,9 @@ import numpy as np
 from gymnasium import spaces
 
 from fed_envs import Family, FederatedVecEnv
+from sb3_fedguide.benchmark.bootstrap import RESAMPLES, percentile_interval, resample
 from sb3_fedguide.common.evaluation import Evaluation, evaluate_federation
 from sb3_fedguide.common.seeding import EVALUATION_SEED, Role
-
-#: Resamples of a bootstrap interval.
-RESAMPLES = 10_000
 
 
 @dataclass(frozen=True)
@@ -87,20 +85,8 @@ def bootstrap_interval(
 
     :param groups: one array ``(n_runs,)`` per family
     """
-    low, high = np.quantile(
-        interquartile_mean(resample(groups, n_resamples, seed)), [(1 - confidence) / 2, (1 + confidence) / 2]
-    )
+    low, high = percentile_interval(interquartile_mean(resample(groups, n_resamples, seed)), confidence)
     return float(low), float(high)
-
-
-def resample(groups: Sequence[np.ndarray], n_resamples: int = RESAMPLES, seed: int = 0) -> list[np.ndarray]:
-    """Bootstrap samples, stratified: each family's runs are drawn from its own.
-
-    :param groups: one array ``(n_runs,)`` per family
-    :return: one array ``(n_resamples, n_runs)`` per family
-    """
-    rng = np.random.default_rng(seed)
-    return [group[rng.integers(0, len(group), (n_resamples, len(group)))] for group in groups]
 
 
 def random_actions(family: Family, n_episodes: int = 10) -> Evaluation:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_fedguide.benchmark.bootstrap import mean_interval
 from sb3_fedguide.benchmark.paper import PAPER_F
 
 #: CV is taken over so many rounds at the end of a run, all of which are evaluated.
@@ -22,9 +23,6 @@ LAST_ROUNDS = 20
 
 #: A client is stuck whose return is below this share of the best that is known of it.
 STUCK = 0.6
-
-#: Resamples of the bootstrap interval of a difference.
-RESAMPLES = 10_000
 
 
 @dataclass(frozen=True)
@@ -317,7 +315,7 @@ def measure(
         speed_up=None if baseline is None else speed_up(results, float(np.mean([result.final for result in baseline]))),
         area=float(np.mean([area(result) for result in results])),
         difference=float(np.mean(paired)) if len(paired) else None,
-        difference_interval=mean_interval(np.array(paired)) if len(paired) > 1 else None,
+        difference_interval=_floats(mean_interval(np.array(paired))) if len(paired) > 1 else None,
         stuck=None if best_known is None else stuck_clients(results, best_known),
     )
 
@@ -347,14 +345,6 @@ def paired_differences(results: Sequence[Result], baseline: Sequence[Result]) ->
     return [result.final - theirs[result.seed] for result in results if result.seed in theirs]
 
 
-def mean_interval(values: np.ndarray, confidence: float = 0.95, seed: int = 0) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean of ``values``, ``(n,)``."""
-    rng = np.random.default_rng(seed)
-    means = values[rng.integers(0, len(values), (RESAMPLES, len(values)))].mean(axis=1)
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return float(low), float(high)
-
-
 def best_known(results: Iterable[Result]) -> np.ndarray | None:
     """The best return of each client in any of the runs, ``(n_clients,)``; ``None`` where a file does not say."""
     best = [np.max([result.client_finals, *result.client_curve.values()], axis=0) for result in results]
@@ -366,6 +356,10 @@ def stuck_clients(results: Sequence[Result], best: np.ndarray) -> float | None:
     if not (best > 0).all():
         return None
     return float(np.mean([(np.array(result.client_finals) < STUCK * best).sum() for result in results]))
+
+
+def _floats(interval: tuple[np.ndarray, np.ndarray]) -> tuple[float, float]:
+    return float(interval[0]), float(interval[1])
 
 
 def _known_mean(values: Sequence[float | None]) -> float | None:

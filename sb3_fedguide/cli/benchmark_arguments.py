@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import OneLineParser, train_parser
@@ -72,13 +73,9 @@ def parse_benchmark(argv: Sequence[str] | None, prog: str) -> argparse.Namespace
 def _check(arguments: argparse.Namespace) -> None:
     if not arguments.envs and not arguments.metadata:
         raise ValueError("give the families with --envs FAMILY ..., or --metadata FILE ...")
-    for flag, values in (("--algos", arguments.algos), ("--envs", arguments.envs), ("--seeds", arguments.seeds)):
-        if repeated := [value for value, count in Counter(values or ()).items() if count > 1]:
-            raise ValueError(f"{flag} names {repeated[0]} twice")
-    if arguments.processes is not None and arguments.processes < 1:
-        raise ValueError(f"--processes must be at least 1, not {arguments.processes}")
-    if negative := [value for value in arguments.seeds or () if value < 0]:
-        raise ValueError(f"--seeds must not be negative, as {negative[0]} is: what is drawn at random cannot be gone on with")
+    for flag, values in (("--algos", arguments.algos), ("--envs", arguments.envs)):
+        check_once(flag, values or ())
+    check_seeds_and_processes(arguments.seeds or (), arguments.processes)
     if wrong := [value for value in arguments.at_rounds if value < 1]:
         raise ValueError(f"--at-rounds counts from 1, but got {wrong[0]}")
     if arguments.address is not None and arguments.engine != "ray":
@@ -87,6 +84,24 @@ def _check(arguments: argparse.Namespace) -> None:
     for file in files:
         if not Path(file).absolute().parent.is_dir() or Path(file).is_dir():
             raise ValueError(f"the tables cannot be written to {file}: {_reason(Path(file))}")
+
+
+def check_once(flag: str, values: Sequence[Any]) -> None:
+    """:raises ValueError: for a value that is given twice"""
+    if repeated := [value for value, count in Counter(values).items() if count > 1]:
+        raise ValueError(f"{flag} names {repeated[0]} twice")
+
+
+def check_seeds_and_processes(seeds: Sequence[int], processes: int | None) -> None:
+    """Of several runs.
+
+    :raises ValueError: for seeds that are negative or given twice, and for no process
+    """
+    check_once("--seeds", seeds)
+    if processes is not None and processes < 1:
+        raise ValueError(f"--processes must be at least 1, not {processes}")
+    if negative := [seed for seed in seeds if seed < 0]:
+        raise ValueError(f"--seeds must not be negative, as {negative[0]} is: what is drawn at random cannot be gone on with")
 
 
 def _reason(path: Path) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import OneLineParser, train_parser
+from sb3_fedguide.cli.benchmark_arguments import check_seeds_and_processes
 
 #: Flags of the training command that say what a run computes.
 SETTINGS = (
@@ -67,12 +67,7 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ValueError(f"give the algorithm with --algo: {', '.join(ALGORITHMS)}")
     if arguments.n_trials is not None and arguments.n_trials < 1:
         raise ValueError(f"--n-trials must be at least 1, not {arguments.n_trials}")
-    if arguments.processes < 1:
-        raise ValueError(f"--processes must be at least 1, not {arguments.processes}")
-    if negative := [seed for seed in arguments.seeds if seed < 0]:
-        raise ValueError(f"--seeds must not be negative, as {negative[0]} is: every trial is to have the same ones")
-    if repeated := [seed for seed, count in Counter(arguments.seeds).items() if count > 1]:
-        raise ValueError(f"--seeds names {repeated[0]} twice")
+    check_seeds_and_processes(arguments.seeds, arguments.processes)
     if arguments.study_name is not None and not _is_file_name(arguments.study_name):
         raise ValueError(
             f"--study-name {arguments.study_name!r} is to be the name of a folder too; leave out / and leading dots"

@@ -149,12 +149,10 @@ class ExchangeCallback(RoundCallback):
         uploads = {client: model.outgoing(index) for client, index in present.items()}
         broadcasts = self.server.exchange(model.round, uploads, set(model.client_ids) - present.keys())
         model.take_broadcasts({present[client]: broadcast for client, broadcast in broadcasts.items()})
-        for client, reason in self.server.rejected.items():
-            warnings.warn(f"round {model.round}: the server rejects the upload of client {client}: {reason}", stacklevel=1)
+        for client in self.server.rejected:
             model.record_client(client, "rejected", 1.0)
-        for client, reason in self.server.new_doubts.items():
-            told = f"round {model.round}: the upload of client {client} is used, but looks wrong: {reason}"
-            warnings.warn(told, stacklevel=1)
+        for complaint in self.server.complaints:
+            warnings.warn(f"round {model.round}: {complaint}", stacklevel=1)
         self._remember_outdated()
         for key, value in self.server.figures.items():
             self.logger.record(key, value)

@@ -14,6 +14,10 @@ from sb3_fedguide.server.participants import n_participants
 _FINISH_SECONDS = 600.0
 
 
+class TooFewClients(RuntimeError):
+    """Fewer clients than a round needs; with a folder, the same call goes on from its checkpoint."""
+
+
 @dataclass(frozen=True)
 class ServerConfig:
     """What a server has to know.

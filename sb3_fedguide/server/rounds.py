@@ -24,8 +24,9 @@ class Rounds:
         #: bytes that all clients together have sent and received, and what of them was before the first round
         self.bytes_up = self.bytes_down = 0
         self.offline_bytes_up = self.offline_bytes_down = 0
-        #: clients whose uploads look wrong since the last exchange and did not before, and why
-        self.new_doubts: dict[int, str] = {}
+        #: what is to be said of the last exchange: which uploads it rejected, and once of each client, which it used although
+        #: they look wrong
+        self.complaints: list[str] = []
         self._doubted: set[int] = set()
         #: figures of the last exchange, by log key
         self.figures: dict[str, float] = {}
@@ -61,8 +62,10 @@ class Rounds:
         self.outdated -= {k for k in missed if k in broadcasts and broadcasts[k].keys() >= self.strategy.latest(k).keys()}
         if any(broadcasts.values()):  # what the others received is what the absent and the rejected have missed
             self.outdated |= {*absent, *self.strategy.rejected}
-        self.new_doubts = {client: why for client, why in self.strategy.doubts.items() if client not in self._doubted}
-        self._doubted |= self.new_doubts.keys()
+        doubts = {client: why for client, why in self.strategy.doubts.items() if client not in self._doubted}
+        self._doubted |= doubts.keys()
+        self.complaints = rejections("upload", self.strategy.rejected)
+        self.complaints += [f"the upload of client {k} is used, but looks wrong: {why}" for k, why in doubts.items()]
         up, down = payload_bytes(uploads), payload_bytes(broadcasts)
         self.count(up, down, offline=round == 0)
         self.figures = {f"federated/{key}": value for key, value in self.strategy.metrics.items()}
@@ -90,6 +93,11 @@ class Rounds:
     @bytes_counted.setter
     def bytes_counted(self, saved: Sequence[int]) -> None:
         self.bytes_up, self.bytes_down, self.offline_bytes_up, self.offline_bytes_down = [*saved, 0, 0][:4]
+
+
+def rejections(what: str, reasons: Mapping[int, str]) -> list[str]:
+    """A sentence for each client of whose ``what`` the server makes no use."""
+    return [f"the server rejects the {what} of client {client}: {reason}" for client, reason in reasons.items()]
 
 
 def participants(clients: Sequence[int], seed: int, round: int, client_fraction: float) -> list[int]:

@@ -16,10 +16,10 @@ from fed_envs.plain_data import State, freeze, thaw
 from sb3_fedguide.common.checkpoint_files import newest_checkpoint, remove_leftovers, write_checkpoint
 from sb3_fedguide.server.build import make_strategy
 from sb3_fedguide.server.clients import OF_A_RUN, Clients, difference, server_facts
-from sb3_fedguide.server.config import ServerConfig
+from sb3_fedguide.server.config import ServerConfig, TooFewClients
 from sb3_fedguide.server.figures import EvaluationTable, count_tests, evaluation_figures, merge_figures, read_evaluations
 from sb3_fedguide.server.payload import Payload
-from sb3_fedguide.server.rounds import Rounds, participants, payload_bytes
+from sb3_fedguide.server.rounds import Rounds, participants, payload_bytes, rejections
 from sb3_fedguide.server.transport import RUN, UNPREPARED, Failure, Kind, Message, Transport
 from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_fault
 
@@ -34,10 +34,6 @@ EVALUATIONS = "evaluations.csv"
 
 #: Called after every round with its number and its log.
 RoundHook = Callable[[int, Mapping[str, float]], None]
-
-
-class TooFewClients(RuntimeError):
-    """Fewer clients than a round needs; with a folder, the same call goes on from its checkpoint."""
 
 
 def serve(
@@ -147,7 +143,7 @@ class Server:
             replies = self._collect(lambda: self._to_joined(Message("moments", 0)), timeout, self._fault_of_moments)
             self._count_trunk(replies, {})
             n_updates = {client: int(reply.facts["n_updates"]) for client, reply in replies.items()}
-            self._reject(excessive := excessive_updates(n_updates), "moments")
+            self._warn(rejections("moments", excessive := excessive_updates(n_updates)))
             moments = {client: reply.payload for client, reply in replies.items() if client not in excessive}
             longest = max(n_updates[client] for client in moments)
             self.trunk = TrunkAverages(moments, longest, int(settings["prior_average_every"]), bound)
@@ -157,7 +153,8 @@ class Server:
             members = self.trunk.clients
             replies = self._collect(lambda: self._to_joined(request, members), timeout)  # noqa: B023 (called at once)
             self._count_trunk(replies, request.payload)
-            self._reject(self.trunk.average({client: reply.payload for client, reply in replies.items()}), "part of the trunk")
+            rejected = self.trunk.average({client: reply.payload for client, reply in replies.items()})
+            self._warn(rejections("part of the trunk", rejected))
             self._save()
 
     def _fault_of_moments(self, reply: Message) -> str | None:
@@ -271,13 +268,11 @@ class Server:
         for client, broadcast in broadcasts.items():
             if broadcast:
                 self.outbox[client] = (self.n_broadcasts, round, broadcast)
-        self._reject(self.rounds.rejected, "upload")
-        for client, reason in self.rounds.new_doubts.items():
-            logger.warning("round %d: the upload of client %d is used, but looks wrong: %s", round, client, reason)
+        self._warn(self.rounds.complaints)
 
-    def _reject(self, reasons: Mapping[int, str], what: str) -> None:
-        for client, reason in reasons.items():
-            logger.warning("round %d: the server rejects the %s of client %d: %s", self.round + 1, what, client, reason)
+    def _warn(self, complaints: Iterable[str]) -> None:
+        for complaint in complaints:
+            logger.warning("round %d: %s", self.round + 1, complaint)
 
     def _there(self) -> list[int]:
         """Who was there at the last look and is ready to train."""

@@ -10,12 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_fedguide.benchmark.aggregate import RESAMPLES, resample
+from sb3_fedguide.benchmark.bootstrap import RESAMPLES, percentile_interval, resample
 
 Interval = tuple[np.ndarray, np.ndarray]
 #: A profile's band is taken over fewer samples: it has a value at each of its levels.
 PROFILE_RESAMPLES = 2_000
-QUANTILES = (0.025, 0.975)
 
 
 def performance_profile(groups: Sequence[np.ndarray], levels: np.ndarray) -> np.ndarray:
@@ -32,8 +31,7 @@ def profile_band(groups: Sequence[np.ndarray], levels: np.ndarray, seed: int = 0
     """Pointwise interval of :func:`performance_profile`, two arrays ``(n_levels,)``."""
     samples = resample(groups, PROFILE_RESAMPLES, seed)
     profiles = np.stack([performance_profile(samples, levels[k : k + 1])[:, 0] for k in range(len(levels))], axis=-1)
-    low, high = np.quantile(profiles, QUANTILES, axis=0)
-    return low, high
+    return percentile_interval(profiles)
 
 
 def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]) -> np.ndarray:
@@ -56,5 +54,5 @@ def improvement_interval(
     """Interval of :func:`probability_of_improvement`; the runs of both are resampled."""
     samples = resample([*ours, *theirs], n_resamples, seed)
     values = probability_of_improvement(samples[: len(ours)], samples[len(ours) :])
-    low, high = np.quantile(values, QUANTILES)
+    low, high = percentile_interval(values)
     return float(low), float(high)

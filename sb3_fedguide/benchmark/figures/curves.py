@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from sb3_fedguide.benchmark.bootstrap import mean_interval
 from sb3_fedguide.benchmark.figures.layout import MEDIUM, SMALL, fit_scale, legend, panels
 from sb3_fedguide.benchmark.figures.runs import Comparison, Run, Runs, names, seeds
 from sb3_fedguide.benchmark.figures.styles import style
@@ -29,8 +30,6 @@ _UNITS = {
     "seconds": {3600.0: " (hours)", 60.0: " (minutes)", 1.0: " (seconds)"},
     "bytes": {1e9: " (GB)", 1e6: " (MB)", 1e3: " (kB)", 1.0: " (bytes)"},
 }
-#: Bootstrap samples of the seeds.
-RESAMPLES = 10_000
 #: Of a line's markers, in lengths of the panel's diagonal: they lie as far apart where every round was evaluated.
 MARKER_SPACING = 0.2
 
@@ -71,10 +70,7 @@ def _band(lines: np.ndarray, band: str) -> tuple[np.ndarray, np.ndarray]:
     """:param lines: ``(n_seeds, n)``"""
     if band == "range":
         return lines.min(axis=0), lines.max(axis=0)
-    drawn = np.random.default_rng(0).integers(0, len(lines), (RESAMPLES, len(lines)))
-    counts = np.stack([(drawn == seed).sum(axis=1) for seed in range(len(lines))], axis=1)
-    low, high = np.quantile(counts @ lines / len(lines), (0.025, 0.975), axis=0)
-    return low, high
+    return mean_interval(lines)
 
 
 def draw_curves(comparison: Comparison, of: str = "average", x: str = "rounds", band: str = "range") -> Figure:
