@@ -308,8 +308,8 @@ def _known(study: optuna.Study, asked: optuna.Trial) -> bool:
             for step, value in earlier.intermediate_values.items():
                 asked.report(value, step)
             asked.set_user_attr("same_as", earlier.number)
-            value = earlier.value if earlier.state == TrialState.COMPLETE else None
-            study.tell(asked, value, state=earlier.state)
+            final = earlier.value if earlier.state == TrialState.COMPLETE else None
+            study.tell(asked, final, state=earlier.state)
             _say(f"trial {asked.number}: the settings of trial {earlier.number}, and its result")
             return True
     return False
