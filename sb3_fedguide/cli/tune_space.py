@@ -27,7 +27,7 @@ OWN: dict[str, dict[str, list[Any]]] = {
     "fedguide": {"lambda_trust": [0.01, 0.05, 0.2], "lambda_prior": [0.02, 0.1, 0.5], "beta": ["auto", 0.25, 0.5]},
     "fedguide-p": {"lambda_trust": [0.01, 0.05, 0.2], "lambda_prior": [0.02, 0.1, 0.5]},
     "fedguide-a": {"lambda_trust": [0.01, 0.05, 0.2], "lambda_prior": [0.02, 0.1, 0.5], "average_every": [1, 5, 10]},
-    "fedguide-r": {"server_step": [1.0, 2.0, 3.0], "mix": ["until_0.3", "until_0.5", "until_0.7"]},
+    "fedguide-r": {"server_step": [1.0, 2.0, 3.0], "mix": ["until_0.3", "until_0.4", "until_0.5"]},
 }
 #: What decides how many environment steps a trial has.
 BUDGET = ("n_rounds", "rollout_size", "client_fraction")
