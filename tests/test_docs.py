@@ -259,3 +259,16 @@ def test_all_flags_of_training_are_documented():
     for action in train_parser("")._actions:
         if action.dest != "help":
             assert any(f"`{option}" in text or f" {option}" in text for option in action.option_strings), action.dest
+
+
+def test_the_flagships_settings_are_the_tuned_ones_on_every_page() -> None:
+    """The table of sharing.md, and every page that says when clients are on their own again."""
+    tuned = resolve("fedguide-r", load_family("HopperHard")).values
+    text = (DOCS / "sharing.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| [^|]* \| ([^|]*) \|", text, re.MULTILINE)
+    said = {name: value.strip().strip("`") for name, value in rows}
+    assert {"normalize", "server_step", "mix", "n_epochs", "screening"} <= said.keys()
+    for name, value in said.items():
+        assert str(tuned[name]) in (value, f"{value}.0"), name
+    for page in ("concepts.md", "algorithms/fedguide-r.md", "sharing.md"):
+        assert set(re.findall(r"until_[\d.]+\d", (DOCS / page).read_text(encoding="utf-8"))) == {tuned["mix"]}, page
