@@ -38,7 +38,7 @@ def test_a_wrong_head_that_passes_the_check_of_norms_is_doubted_and_honest_ones_
             server = exchanged(wrong)
             assert [*server.doubts] == [5] and not server.rejected
             share = server.client_metrics["head_share"][5]
-            assert f"; {share:.1%} of the others' priors comes from it, where an even share would be 12.5%" in server.doubts[5]
+            assert f"; the others' priors take {share:.1%} from it (an even share is 12.5%)" in server.doubts[5]
 
 
 def test_what_is_said_of_heads_against_its_definition():
@@ -73,5 +73,7 @@ def test_a_doubtful_client_is_named_once_and_logged_every_round(small):
         warnings.simplefilter("always")
         model.learn(3 * model.rollout_size * model.n_clients, Watch())
     told = [str(warning.message) for warning in caught if "looks wrong" in str(warning.message)]
-    assert len(told) == 1 and "round 0: the upload of client 2 is used, but looks wrong: its prior head agrees" in told[0]
+    assert (
+        len(told) == 1 and "round 0: the upload of client 2 is used, but looks wrong: the cosine of its prior head" in told[0]
+    )
     assert len(logged) == 3 and max(logged) < 0

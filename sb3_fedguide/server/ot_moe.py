@@ -300,8 +300,8 @@ class OTMoE(Strategy):
         for client, own, share in zip(clients, agreement, shares, strict=True):
             if own < usual - LEAST_AGREEMENT:
                 self.doubts[client] = (
-                    f"its prior head agrees with the others' to {own:.2f}, where {usual:.2f} is usual; {share:.1%} of the "
-                    f"others' priors comes from it, where an even share would be {1 / len(clients):.1%}"
+                    f"the cosine of its prior head and the median head is {own:.2f}, and the clients' median of that {usual:.2f}; "
+                    f"the others' priors take {share:.1%} from it (an even share is {1 / len(clients):.1%})"
                 )
 
     def _measure(self, cost: np.ndarray, rows: np.ndarray, error: float) -> None:
