@@ -73,7 +73,5 @@ def test_a_doubtful_client_is_named_once_and_logged_every_round(small):
         warnings.simplefilter("always")
         model.learn(3 * model.rollout_size * model.n_clients, Watch())
     told = [str(warning.message) for warning in caught if "looks wrong" in str(warning.message)]
-    assert (
-        len(told) == 1 and "round 0: the upload of client 2 is used, but looks wrong: the cosine of its prior head" in told[0]
-    )
+    assert len(told) == 1 and told[0].startswith("round 0: the upload of client 2 is used, but looks wrong: the cosine of")
     assert len(logged) == 3 and max(logged) < 0

@@ -300,7 +300,7 @@ class OTMoE(Strategy):
         for client, own, share in zip(clients, agreement, shares, strict=True):
             if own < usual - LEAST_AGREEMENT:
                 self.doubts[client] = (
-                    f"the cosine of its prior head and the median head is {own:.2f}, in the middle of the clients {usual:.2f}; "
+                    f"the cosine of its prior head and the median head is {own:.2f}, for the median client {usual:.2f}; "
                     f"the others' priors take {share:.1%} from it (an even share is {1 / len(clients):.1%})"
                 )
 
