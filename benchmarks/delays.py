@@ -28,10 +28,10 @@ from fed_envs.clients import BANDIT2D_PEAKS
 from fed_envs.generation import generate_family
 from fed_envs.metadata import parse_family
 from sb3_fedguide.benchmark.bandit2d import policies
-from sb3_fedguide.cli.config import resolve
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.participation import simulate_delays
 from sb3_fedguide.server.delays import Delays, parse_delays
+from sb3_fedguide.settings.config import resolve
 
 PATH = Path(__file__).parent / "results" / "delays_Bandit2D.json"
 ALGOS = ("local", "fedavg", "fedguide")

@@ -20,8 +20,8 @@ from record import spread, write_result
 
 from fed_envs import load_family
 from sb3_fedguide.algorithms.fedguide import FedGuide
-from sb3_fedguide.cli.config import resolve
-from sb3_fedguide.common.seeding import Role
+from sb3_fedguide.seeding import Role
+from sb3_fedguide.settings.config import resolve
 
 SUBSETS = (128, 256, 512, 1024)
 

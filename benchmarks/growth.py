@@ -23,8 +23,8 @@ import torch as th
 from record import spread, write_result
 
 from fed_envs.generation import generate_family
-from sb3_fedguide.algorithms import algorithm
 from sb3_fedguide.common.callbacks import RoundCallback
+from sb3_fedguide.registry import algorithm
 
 PHASES = ("rollout", "train", "exchange")
 SETTINGS: dict[str, Any] = {"learning_rate": 3e-4, "batch_size": 64, "n_epochs": 4, "policy_kwargs": {"net_arch": [64, 64]}}

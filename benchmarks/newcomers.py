@@ -20,9 +20,9 @@ import torch as th
 from record import write_result
 
 import fed_envs
-from sb3_fedguide.cli.config import resolve
 from sb3_fedguide.common.evaluation import FederatedEvalCallback
 from sb3_fedguide.common.newcomers import start_from
+from sb3_fedguide.settings.config import resolve
 
 
 class Curve(FederatedEvalCallback):

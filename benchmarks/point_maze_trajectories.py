@@ -26,7 +26,7 @@ from fed_envs.clients import PointMazeClient
 from fed_envs.mazes import WALL, maze_rows
 from fed_envs.point_maze import SUCCESS_DISTANCE
 from sb3_fedguide.cli import saved_run
-from sb3_fedguide.common.seeding import EVALUATION_SEED, Role
+from sb3_fedguide.seeding import EVALUATION_SEED, Role
 
 COLORS = ("#2e86ab", "#d1495b", "#3a7d44", "#8e5ea2", "#d98c21", "#777777")
 

@@ -23,10 +23,10 @@ import torch as th
 
 from fed_envs import Family, load_family
 from fed_envs.generation import generate_family
-from sb3_fedguide.cli.config import resolve
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.evaluation import evaluate_federation, evaluation_env
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload
+from sb3_fedguide.settings.config import resolve
 
 RESULTS = Path(__file__).parent / "results"
 N_ROUNDS, N_EPISODES = 30, 10

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from fed_envs import FAMILIES, Family, load_family
 from fed_envs.registration import environment_id
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
-from sb3_fedguide.cli.config import resolve
+from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.settings.config import resolve
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent

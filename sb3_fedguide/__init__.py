@@ -13,7 +13,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sb3_fedguide.algorithms import register_algorithm
     from sb3_fedguide.algorithms.fedavg import FedAvg
     from sb3_fedguide.algorithms.fedguide import FedGuide, FedGuideA, FedGuideP
     from sb3_fedguide.algorithms.fedguide_r import FedGuideR
@@ -28,9 +27,10 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ppo import FederatedPPO
     from sb3_fedguide.monitoring.callbacks import TensorBoardCallback
     from sb3_fedguide.monitoring.diagnostics import DiagnosticsCallback
+    from sb3_fedguide.registry import register_algorithm
 
 _LAZY = {
-    "register_algorithm": "sb3_fedguide.algorithms",
+    "register_algorithm": "sb3_fedguide.registry",
     "DiagnosticsCallback": "sb3_fedguide.monitoring.diagnostics",
     "FedAvg": "sb3_fedguide.algorithms.fedavg",
     "FedGuide": "sb3_fedguide.algorithms.fedguide",

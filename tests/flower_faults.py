@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_fedguide.common import site
-from sb3_fedguide.server.transport import Message
+from sb3_fedguide.deployment import site
+from sb3_fedguide.deployment.transport import Message
 
 FILE = Path(os.environ["FEDGUIDE_FAULTS"])
 STALLED = FILE.with_suffix(".stalled")

@@ -26,9 +26,9 @@ import sb3_fedguide.cli.recorder
 import sb3_fedguide.monitoring.callbacks
 import sb3_fedguide.offline.pretraining  # noqa: F401
 from fed_envs import FederatedVecEnv
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.train import main
 from sb3_fedguide.common import checkpoint
+from sb3_fedguide.registry import ALGORITHMS, algorithm
 
 PLACES: dict[str, tuple[Any, str]] = {
     "step": (FederatedVecEnv, "step_wait"),

@@ -14,7 +14,7 @@ from sb3_fedguide.cli.train import main
 from sb3_fedguide.common import federation, gaussian
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES, CRITIC_PREFIXES
-from sb3_fedguide.common.seeding import stream
+from sb3_fedguide.seeding import stream
 from sb3_fedguide.server.strategy import N_SAMPLES
 from sb3_fedguide.server.svrpg import DIRECTION, SVRPG
 from tests.conftest import PointEnv, assert_same_parameters, parameters_of

@@ -9,9 +9,9 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_fedguide.common.stacked import stack_module
 from sb3_fedguide.offline.behavior_cloning import clone
 from sb3_fedguide.offline.data import normalize_observations
+from sb3_fedguide.state.stacked import stack_module
 
 
 def rngs(which: list[int]) -> list[np.random.Generator]:

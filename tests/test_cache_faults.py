@@ -18,13 +18,13 @@ import fed_envs
 from fed_envs.files import atomic_file
 from sb3_fedguide import Local
 from sb3_fedguide.cli.train import main
-from sb3_fedguide.common.array_files import read_arrays, write_arrays
 from sb3_fedguide.common.ppo_policy import StackedActor
 from sb3_fedguide.offline import pretraining
 from sb3_fedguide.offline.cache import cached_arrays, check_cache_folder, keep_arrays
-from sb3_fedguide.offline.config import PretrainingConfig
 from sb3_fedguide.offline.datasets import client_datasets, dataset_folder
 from sb3_fedguide.offline.pretraining import Pretraining
+from sb3_fedguide.settings.pretraining import PretrainingConfig
+from sb3_fedguide.state.array_files import read_arrays, write_arrays
 
 TINY = PretrainingConfig(
     dataset_size=40, prior="diffusion", prior_updates=2, prior_width=8, dice_updates=2, dice_width=8, bc_updates=2
@@ -40,7 +40,7 @@ def results(cache: Path) -> dict[str, np.ndarray]:
     """Everything that an offline stage gives, by name."""
     from torch import nn
 
-    from sb3_fedguide.common.stacked import stack_module
+    from sb3_fedguide.state.stacked import stack_module
 
     made = stage(cache)
     fitted, dice = made.prior(), made.dice()

@@ -14,7 +14,6 @@ import pytest
 import sb3_fedguide.common.checkpoint as checkpoint_module
 from fed_envs.state import freeze, thaw
 from sb3_fedguide import FedAvg
-from sb3_fedguide.common.array_files import read_arrays, write_arrays
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import (
     CheckpointCallback,
@@ -24,6 +23,7 @@ from sb3_fedguide.common.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
+from sb3_fedguide.state.array_files import read_arrays, write_arrays
 from tests.test_env_state import CountingEnv
 
 STATE = {

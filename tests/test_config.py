@@ -8,10 +8,10 @@ import pytest
 import torch as th
 
 import fed_envs
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
-from sb3_fedguide.cli import schema
-from sb3_fedguide.cli.config import CONFIGURATIONS, config_path, parse_params, read_config, resolve
 from sb3_fedguide.common.federated_ppo import FederatedPPO
+from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.settings import schema
+from sb3_fedguide.settings.config import CONFIGURATIONS, config_path, parse_params, read_config, resolve
 
 BANDIT = fed_envs.load_family("Bandit2D")
 

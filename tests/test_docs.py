@@ -12,11 +12,11 @@ import gymnasium as gym
 import pytest
 
 from fed_envs import FAMILIES, load_family
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli import benchmark_arguments, deploy, evaluate, export
 from sb3_fedguide.cli.arguments import parse_train, train_parser
-from sb3_fedguide.cli.config import parse_params, resolve
 from sb3_fedguide.cli.main import USAGE
+from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.settings.config import parse_params, resolve
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -139,7 +139,7 @@ def test_every_family_has_its_page(families):
 
 
 def test_a_pages_parameters_are_the_constructors(pages):
-    from sb3_fedguide.cli.schema import hyperparameters
+    from sb3_fedguide.settings.schema import hyperparameters
 
     for name in ALGORITHMS:
         cls = algorithm(name)

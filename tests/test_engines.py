@@ -13,13 +13,13 @@ from stable_baselines3.common.callbacks import EvalCallback
 
 from fed_envs.faults import ClientError
 from sb3_fedguide import Local
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.train import main
 from sb3_fedguide.engines import make_engine
-from sb3_fedguide.engines.client_axis import join_clients, take_clients
 from sb3_fedguide.engines.engine import Engine, EngineError
 from sb3_fedguide.engines.processes import Processes
 from sb3_fedguide.engines.worker import Worker
+from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.state.client_axis import join_clients, take_clients
 from tests.test_checkpoint import same
 from tests.test_env_state import CountingEnv
 from tests.test_resume import ROUNDS, make, train

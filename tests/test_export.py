@@ -15,12 +15,12 @@ from stable_baselines3 import DDPG, PPO
 
 from sb3_fedguide import FedAvg, FedRL, Local
 from sb3_fedguide.cli.main import main
-from sb3_fedguide.common.array_files import write_arrays
 from sb3_fedguide.common.export import Normalization, features_extractor
 from sb3_fedguide.common.parameters import read_policies
-from sb3_fedguide.common.site import PARAMETERS, SITE, Site
 from sb3_fedguide.common.spaces import describe_space, space_from
-from sb3_fedguide.server.serve import ServerConfig, serve
+from sb3_fedguide.deployment.serve import ServerConfig, serve
+from sb3_fedguide.deployment.site import PARAMETERS, SITE, Site
+from sb3_fedguide.state.array_files import write_arrays
 from tests.loop_transport import LoopTransport
 from tests.test_discrete_actions import SPACES, choices
 
@@ -226,7 +226,7 @@ def test_a_file_of_ddpg_policies(point_envs, tmp_path):
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(run, flags, message, tmp_path, capsys):
-    from sb3_fedguide.common.array_files import read_arrays
+    from sb3_fedguide.state.array_files import read_arrays
 
     for name in ("early", "damaged", "lies", "old"):
         (tmp_path / name).mkdir()

@@ -16,9 +16,9 @@ from gymnasium.utils.env_checker import check_env
 import fed_envs
 from fed_envs import FederatedVecEnv
 from fed_envs.metadata import parse_family
-from sb3_fedguide.algorithms import ALGORITHMS, register_algorithm
 from sb3_fedguide.cli.evaluate import main as evaluate
 from sb3_fedguide.cli.train import main
+from sb3_fedguide.registry import ALGORITHMS, register_algorithm
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs" / "examples"

@@ -18,7 +18,7 @@ from fed_envs import FederatedVecEnv
 from sb3_fedguide import FederatedDDPG, FedRL
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
 from sb3_fedguide.common.replay_buffer import FederatedReplayBuffer
-from sb3_fedguide.common.seeding import Role
+from sb3_fedguide.seeding import Role
 from tests.conftest import assert_same_parameters, parameters_of
 
 SMALL = {

@@ -17,8 +17,8 @@ from fed_envs import FederatedVecEnv
 from sb3_fedguide import FederatedPPO, Local
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.rollout_buffer import generalized_advantage
-from sb3_fedguide.common.seeding import Role
-from sb3_fedguide.common.stacked import clip_grad_norm_per_client
+from sb3_fedguide.seeding import Role
+from sb3_fedguide.state.stacked import clip_grad_norm_per_client
 from tests.conftest import assert_same_parameters, parameters_of
 
 # Sources of the upstream methods that this package re-implements. When one of these fails after an upgrade of SB3, read

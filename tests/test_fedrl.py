@@ -14,7 +14,7 @@ from fed_envs.bandit2d import PEAKS
 from sb3_fedguide import FederatedDDPG, FedRL
 from sb3_fedguide.cli.train import main
 from sb3_fedguide.common.callbacks import RoundCallback
-from sb3_fedguide.common.seeding import Role
+from sb3_fedguide.seeding import Role
 from sb3_fedguide.server.averaging import Averaging
 from sb3_fedguide.server.strategy import N_SAMPLES
 from tests.conftest import assert_same_parameters, parameters_of

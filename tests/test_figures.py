@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.benchmark.figures.bars import draw_bars, draw_speed_up
 from sb3_fedguide.benchmark.figures.clients import client_returns, share_of_best
 from sb3_fedguide.benchmark.figures.comparisons import (
@@ -21,6 +20,7 @@ from sb3_fedguide.benchmark.figures.layout import fit_scale, panels
 from sb3_fedguide.benchmark.figures.runs import from_result
 from sb3_fedguide.benchmark.figures.styles import STYLES, style
 from sb3_fedguide.benchmark.results import read_result
+from sb3_fedguide.registry import ALGORITHMS
 from tests.result_files import CLIENTS, result, write_result
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")

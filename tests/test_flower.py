@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fed_envs
-from sb3_fedguide.cli.config import resolve
+from sb3_fedguide.settings.config import resolve
 from tests.flower_deployment import Deployment
 
 pytestmark = pytest.mark.flower

@@ -108,9 +108,9 @@ import sys
 from flwr.cli.build import build_fab_from_files
 from flwr.supercore.fab import Fab
 import hashlib
-from sb3_fedguide.flower import server_node
+from sb3_fedguide.deployment.flower import server_node
 def app_bundle():
-    toml = server_node._APP.replace("sb3_fedguide.flower.client_app:app", "evil:app")
+    toml = server_node._APP.replace("sb3_fedguide.deployment.flower.client_app:app", "evil:app")
     assert "evil:app" in toml
     files = {"pyproject.toml": toml.encode(), "evil.py": b"open('EXECUTED', 'w')"}
     content = build_fab_from_files(files)[0]

@@ -15,14 +15,14 @@ import pytest
 import yaml
 
 from sb3_fedguide.cli.main import main as fedguide
-from sb3_fedguide.server.transport import Failure, Message
+from sb3_fedguide.deployment.transport import Failure, Message
 from tests.flower_deployment import SMALL
 
 pytestmark = pytest.mark.flower
 
 
 def test_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from sb3_fedguide.flower.certificates import read_public_key
+    from sb3_fedguide.deployment.flower.certificates import read_public_key
 
     assert fedguide(["deploy", "key", str(tmp_path), "client_0"]) == 0
     assert (tmp_path / "client_0").stat().st_mode & 0o777 == 0o600
@@ -88,10 +88,10 @@ def test_wrong_configurations_are_refused_in_one_line(keys: Path, kind: str, cha
 
 
 def test_the_server_takes_what_concerns_it_from_the_clients_settings(keys: Path) -> None:
-    from sb3_fedguide.cli.deploy_config import ROLLOUT_SIZE, ServerDeployment
-    from sb3_fedguide.cli.schema import hyperparameters
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
+    from sb3_fedguide.deployment.files import ROLLOUT_SIZE, ServerDeployment
+    from sb3_fedguide.settings.schema import hyperparameters
 
     path = keys / "server.yml"
     path.write_text(yaml.safe_dump({**SERVER, "params": {"eta": 0.2, "learning_rate": 1e-3, "n_rounds": 7}}))
@@ -104,7 +104,7 @@ def test_the_server_takes_what_concerns_it_from_the_clients_settings(keys: Path)
 def test_settings_are_where_the_file_says_whatever_the_working_directory_is(
     keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sb3_fedguide.cli.deploy_config import ClientDeployment, ServerDeployment
+    from sb3_fedguide.deployment.files import ClientDeployment, ServerDeployment
 
     (keys / "own.yml").write_text(yaml.safe_dump({"default": {"n_rounds": 7}}))
     monkeypatch.chdir(tmp_path)
@@ -131,7 +131,7 @@ class Grid:
         return self.pushed.pop(0)
 
     def pull_messages(self, numbers: list[str]) -> list[Any]:
-        from sb3_fedguide.flower.records import to_records
+        from sb3_fedguide.deployment.flower.records import to_records
 
         assert all(numbers)
         content = to_records(Message("round", 1))
@@ -154,7 +154,7 @@ def task(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("refused", [[], [None], [""]], ids=["too large", "refused", "not stored"])
 def test_a_request_that_flower_does_not_take_is_a_failure(refused: list[str | None]) -> None:
     """Flower has no exception for it, and the others' answers count."""
-    from sb3_fedguide.flower.transport import FlowerTransport
+    from sb3_fedguide.deployment.flower.transport import FlowerTransport
 
     requests = {client: Message("round", 1) for client in (0, 1, 2)}
     replies = FlowerTransport(Grid(refused, ["1"]), {b"a": 0, b"b": 1, b"c": 2}).exchange(requests, 60.0)  # type: ignore[arg-type]
@@ -165,7 +165,7 @@ def test_a_request_that_flower_does_not_take_is_a_failure(refused: list[str | No
 @pytest.mark.parametrize(("timeout", "limit"), [(60.0, 60.0), (None, 10 * 365 * 86400.0), (1e12, 10 * 365 * 86400.0)])
 def test_no_timeout_is_none(timeout: float | None, limit: float) -> None:
     """Flower would forget a message without a limit after twelve hours, and refuses one that ends after the year 9999."""
-    from sb3_fedguide.flower.transport import FlowerTransport
+    from sb3_fedguide.deployment.flower.transport import FlowerTransport
 
     grid = Grid(["1"])
     assert FlowerTransport(grid, {b"a": 0}).exchange({0: Message("round", 1)}, timeout) == {0: Message("round", 1)}  # type: ignore[arg-type]
@@ -176,8 +176,8 @@ def test_a_client_that_has_finished_ends_at_once(
     keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As after a reboot: it waits for no server. With other settings it is refused; what has not finished is started."""
-    from sb3_fedguide.common.site import make_site
-    from sb3_fedguide.flower import client_node
+    from sb3_fedguide.deployment.flower import client_node
+    from sb3_fedguide.deployment.site import make_site
 
     class StartedError(Exception):
         pass
@@ -217,7 +217,7 @@ def test_a_client_that_has_finished_ends_at_once(
 
 
 def test_messages_survive_flower(certificates: Path) -> None:
-    from sb3_fedguide.flower.records import from_records, to_records
+    from sb3_fedguide.deployment.flower.records import from_records, to_records
 
     payload = {
         "prior.head": np.arange(6, dtype=np.float32).reshape(2, 3),
@@ -238,7 +238,7 @@ def test_messages_survive_flower(certificates: Path) -> None:
 def test_foreign_messages_are_errors_and_nothing_else() -> None:
     from flwr.app import Array, ArrayRecord, ConfigRecord, RecordDict
 
-    from sb3_fedguide.flower.records import from_records
+    from sb3_fedguide.deployment.flower.records import from_records
 
     def records(text: str, **arrays: Array) -> RecordDict:
         return RecordDict({"message": ConfigRecord({"text": text}), "payload": ArrayRecord(arrays)})
@@ -274,7 +274,7 @@ def test_the_apps_bundle_holds_no_code() -> None:
     import io
     import zipfile
 
-    from sb3_fedguide.flower.server_node import app_bundle
+    from sb3_fedguide.deployment.flower.server_node import app_bundle
 
     with zipfile.ZipFile(io.BytesIO(app_bundle().content)) as bundle:
         assert sorted(bundle.namelist()) == [".info/CONTENT", "pyproject.toml"]
@@ -283,7 +283,7 @@ def test_the_apps_bundle_holds_no_code() -> None:
 def test_flower_is_told_to_be_silent() -> None:
     """Whatever part of the package is imported first, Flower's telemetry is off, in this process and those it starts."""
     code = (
-        "import os, sb3_fedguide.flower.client_app, flwr.supercore.telemetry as telemetry; "
+        "import os, sb3_fedguide.deployment.flower.client_app, flwr.supercore.telemetry as telemetry; "
         "print(telemetry.FLWR_TELEMETRY_ENABLED, os.environ['FLWR_DISABLE_UPDATE_CHECK'])"
     )
     env = {name: value for name, value in os.environ.items() if not name.startswith("FLWR")}
@@ -293,7 +293,7 @@ def test_flower_is_told_to_be_silent() -> None:
 
 def test_the_server_needs_neither_pytorch_nor_a_simulator() -> None:
     code = (
-        "import sys; import sb3_fedguide.cli.deploy_config, sb3_fedguide.flower.server_node, sb3_fedguide.flower.server_app; "
+        "import sys; from sb3_fedguide.deployment import files; from sb3_fedguide.deployment.flower import server_app, server_node; "
         "print(*{'torch', 'mujoco', 'stable_baselines3'} & sys.modules.keys())"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -301,7 +301,7 @@ def test_the_server_needs_neither_pytorch_nor_a_simulator() -> None:
 
 
 def test_another_version_of_flower_is_refused(monkeypatch: pytest.MonkeyPatch, capsys, tmp_path: Path) -> None:
-    from sb3_fedguide.flower import processes
+    from sb3_fedguide.deployment.flower import processes
 
     monkeypatch.setattr(processes, "version", lambda package: "1.42.0")
     assert fedguide(["deploy", "key", str(tmp_path), "client_0"]) == 2
@@ -311,7 +311,7 @@ def test_another_version_of_flower_is_refused(monkeypatch: pytest.MonkeyPatch, c
 def test_the_pinned_app_refuses_a_flower_without_what_it_replaces(monkeypatch: pytest.MonkeyPatch) -> None:
     import importlib
 
-    from sb3_fedguide.flower.client_node import run_installed_app
+    from sb3_fedguide.deployment.flower.client_node import run_installed_app
 
     flower = importlib.import_module("flwr.supernode.runtime.run_clientapp")
     for name in ("install_from_fab", "get_load_client_app_fn"):

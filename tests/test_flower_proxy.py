@@ -46,8 +46,8 @@ class Upstream(http.server.BaseHTTPRequestHandler):
 @pytest.fixture(scope="module")
 def proxy(certificates: Path) -> Iterator[int]:
     """Port of a proxy before an upstream that answers everything."""
-    from sb3_fedguide.flower.processes import free_port
-    from sb3_fedguide.flower.proxy import FleetProxy, ProxyServer
+    from sb3_fedguide.deployment.flower.processes import free_port
+    from sb3_fedguide.deployment.flower.proxy import FleetProxy, ProxyServer
 
     upstream = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Upstream)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -136,7 +136,7 @@ def test_proxy_passes_no_second_request_in_a_body(certificates: Path, proxy: int
 
 
 def test_proxy_refuses_what_no_chunk_of_flower_is(certificates: Path, proxy: int) -> None:
-    from sb3_fedguide.flower.proxy import MAX_BODY
+    from sb3_fedguide.deployment.flower.proxy import MAX_BODY
 
     assert ask(certificates, proxy, post("/v1/fleet/push-object", b"x" * (MAX_BODY + 1)))[0] == 413
 
@@ -173,7 +173,7 @@ def test_an_authority_outlives_what_it_signs(
     """At the end of a server's certificate the authority lives as long again, and where it does not, that is said."""
     from cryptography import x509
 
-    from sb3_fedguide.flower import certificates
+    from sb3_fedguide.deployment.flower import certificates
 
     def days_left(path: Path) -> int:
         ends = x509.load_pem_x509_certificate(path.read_bytes()).not_valid_after_utc

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 import fed_envs
 from fed_envs.metadata_command import main as metadata_command
-from sb3_fedguide.cli import schema
-from sb3_fedguide.cli.config import NESTED, resolve
 from sb3_fedguide.cli.evaluate import main as evaluate
 from sb3_fedguide.cli.main import main as fedguide
 from sb3_fedguide.cli.train import Run, main
-from sb3_fedguide.offline.config import PretrainingConfig
+from sb3_fedguide.settings import schema
+from sb3_fedguide.settings.config import NESTED, resolve
+from sb3_fedguide.settings.pretraining import PretrainingConfig
 
 
 def fuzz(max_examples: int) -> settings:

@@ -10,11 +10,11 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_fedguide.common.stacked import stack_module
 from sb3_fedguide.offline import behavior_cloning, dice, groups, trunk
 from sb3_fedguide.offline.data import OfflineData
 from sb3_fedguide.offline.groups import client_groups, train_together
 from sb3_fedguide.priors import DiffusionPrior
+from sb3_fedguide.state.stacked import stack_module
 
 N_CLIENTS = 9
 

@@ -15,8 +15,8 @@ import fed_envs
 from fed_envs import FederatedVecEnv
 from sb3_fedguide import Local
 from sb3_fedguide.cli.evaluate import main as evaluate
-from sb3_fedguide.cli.site_config import make_client, read_site_config
 from sb3_fedguide.cli.train import main
+from sb3_fedguide.deployment.site_config import make_client, read_site_config
 from sb3_fedguide.offline.make_dataset import make_dataset
 from tests.conftest import assert_same_parameters
 from tests.test_engines import Here

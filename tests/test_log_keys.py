@@ -11,12 +11,12 @@ import pytest
 from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
 from sb3_fedguide import FedAvg, FedGuide, Local
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.common.evaluation import FederatedEvalCallback
 from sb3_fedguide.common.participation import simulate_delays
 from sb3_fedguide.monitoring.callbacks import TensorBoardCallback
 from sb3_fedguide.monitoring.charts import chart_layout
 from sb3_fedguide.monitoring.diagnostics import DiagnosticsCallback
+from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.server.delays import parse_delays
 
 PAGE = Path(__file__).parents[1] / "docs" / "log_keys.md"

@@ -112,7 +112,7 @@ def test_a_relative_cache_keeps_what_is_made(how: str, tmp_path: Path, monkeypat
 def test_a_rollout_is_that_of_the_clients_own_environment(family: str) -> None:
     """Every stored transition is repeated in the client's single environment, from a reset with the copy's own seed."""
     from fed_envs.seeding import integer_seed
-    from sb3_fedguide.common.seeding import Role
+    from sb3_fedguide.seeding import Role
 
     (data,) = client_datasets(family, size=SIZE, seed=5, clients=[2])
     assert len(data) == SIZE

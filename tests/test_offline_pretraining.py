@@ -11,10 +11,10 @@ import torch as th
 from pydantic import ValidationError
 from torch import nn
 
-from sb3_fedguide.common.stacked import stack_module
 from sb3_fedguide.offline import pretraining
 from sb3_fedguide.offline.pretraining import PretrainedPrior, Pretraining, PretrainingConfig
 from sb3_fedguide.priors import GaussianPrior
+from sb3_fedguide.state.stacked import stack_module
 
 TINY: dict[str, Any] = {
     "dataset_size": 80,

@@ -302,8 +302,8 @@ def test_picture_of_trajectories(tmp_path, monkeypatch, capsys):
     import json
     from pathlib import Path
 
-    from sb3_fedguide.cli.config import resolve
     from sb3_fedguide.cli.run_folder import PARAMETERS, write_deployed, write_yaml
+    from sb3_fedguide.settings.config import resolve
 
     path = Path(__file__).resolve().parent.parent / "benchmarks" / "point_maze_trajectories.py"
     spec = importlib.util.spec_from_file_location("point_maze_trajectories", path)

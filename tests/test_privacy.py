@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.offline import trunk as trunk_module
 from sb3_fedguide.offline.datasets import client_datasets
+from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.server.strategy import Strategy
 
 PAGE = (Path(__file__).parents[1] / "docs" / "privacy.md").read_text(encoding="utf-8")

@@ -118,7 +118,7 @@ class Answering(http.server.BaseHTTPRequestHandler):
 def test_the_loopback_device_needs_no_proxy(given, monkeypatch):
     httpx = pytest.importorskip("httpx")
     pytest.importorskip("flwr")
-    from sb3_fedguide.flower.processes import environment, loopback_without_proxy
+    from sb3_fedguide.deployment.flower.processes import environment, loopback_without_proxy
 
     for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"):
         monkeypatch.setenv(name, "http://127.0.0.1:9")  # nobody answers there

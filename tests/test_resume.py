@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch as th
 
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.recorder import CostCallback, DeployedCallback, RunEvalCallback
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.evaluation import FederatedEvalCallback
+from sb3_fedguide.registry import ALGORITHMS, algorithm
 from tests.test_checkpoint import same
 from tests.test_env_state import CountingEnv
 

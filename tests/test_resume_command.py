@@ -17,11 +17,11 @@ import pytest
 import yaml
 
 from fed_envs.state import freeze
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.run_folder import exclusive
 from sb3_fedguide.cli.train import main
-from sb3_fedguide.common.array_files import read_arrays
 from sb3_fedguide.common.checkpoint import checkpoints
+from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.state.array_files import read_arrays
 from tests.test_checkpoint import same
 
 ROOT = Path(__file__).parents[1]

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from sb3_fedguide import FedAvg, FedGuideA
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
-from sb3_fedguide.cli.schema import hyperparameters
+from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.server import build
 from sb3_fedguide.server.averaging import Averaging
 from sb3_fedguide.server.build import METHODS, Method, complete_settings, make_strategy, register_method
@@ -17,6 +16,7 @@ from sb3_fedguide.server.ot_moe import OTMoE
 from sb3_fedguide.server.participants import draw_participants
 from sb3_fedguide.server.rounds import Rounds, participants
 from sb3_fedguide.server.svrpg import SVRPG
+from sb3_fedguide.settings.schema import hyperparameters
 from tests.loop_transport import NAME
 
 # --- rounds ---------------------------------------------------------------------------------------------------------------

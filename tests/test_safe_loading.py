@@ -19,13 +19,13 @@ import torch as th
 import fed_envs
 import sb3_fedguide
 from sb3_fedguide import FedAvg, FedGuide, FedRL, Local
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.cli.main import main
-from sb3_fedguide.common.array_files import load_arrays, read_arrays, write_arrays
 from sb3_fedguide.offline.behavior import BehaviorPolicy
 from sb3_fedguide.offline.cache import cached_arrays
 from sb3_fedguide.offline.datasets import client_datasets
 from sb3_fedguide.offline.minari_io import check_spaces, find_dataset, read_minari
+from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.state.array_files import load_arrays, read_arrays, write_arrays
 
 OFFLINE = {"dataset_size": 60, "bc_updates": 2, "dice_updates": 2, "prior_updates": 2, "dice_width": 16, "prior_width": 8}
 SMALL = {"rollout_size": 50, "batch_size": 25, "pretraining": OFFLINE, "policy_kwargs": {"net_arch": [8]}, "normalize": True}

@@ -194,7 +194,7 @@ def test_every_range_is_checked_by_the_constructors(point_envs):
 
 
 def _names(cls):
-    from sb3_fedguide.cli.schema import hyperparameters
+    from sb3_fedguide.settings.schema import hyperparameters
 
     return {*hyperparameters(cls), "num_threads"}
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from fed_envs.faults import ClientError
-from sb3_fedguide.server.figures import ClientEvaluation, evaluation_figures, merge_figures, read_evaluations
-from sb3_fedguide.server.transport import Message
+from sb3_fedguide.deployment.metrics import ClientEvaluation, evaluation_figures, merge_figures, read_evaluations
+from sb3_fedguide.deployment.transport import Message
 from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_fault
 from tests.loop_transport import NAME, Client, LoopTransport, run
 
@@ -125,8 +125,8 @@ for name in METHODS:
     make_strategy(name, {}, 3, 0)
 import numpy as np
 import sb3_fedguide
-from sb3_fedguide.server.serve import ServerConfig, serve
-from sb3_fedguide.server.transport import Message
+from sb3_fedguide.deployment.serve import ServerConfig, serve
+from sb3_fedguide.deployment.transport import Message
 
 class Transport:
     def clients(self):

@@ -304,7 +304,7 @@ def test_of_one_client_pooled_is_ppo(point_envs, small):
 
 
 def test_pooled_stays_in_one_process(point_envs, small):
-    from sb3_fedguide.common.site import Site
+    from sb3_fedguide.deployment.site import Site
     from sb3_fedguide.engines.processes import Processes
 
     with pytest.raises(ValueError, match="client_fraction"):

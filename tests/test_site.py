@@ -17,11 +17,11 @@ import fed_envs
 import sb3_fedguide
 from fed_envs.metadata import Family, parse_family
 from sb3_fedguide import FedAvg, FederatedEvalCallback
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
 from sb3_fedguide.common.federation import Federation
-from sb3_fedguide.common.site import PARAMETERS, Site, make_site
-from sb3_fedguide.server.serve import ServerConfig, TooFewClients, serve
-from sb3_fedguide.server.transport import RUN, Message
+from sb3_fedguide.deployment.serve import ServerConfig, TooFewClients, serve
+from sb3_fedguide.deployment.site import PARAMETERS, Site, make_site
+from sb3_fedguide.deployment.transport import RUN, Message
+from sb3_fedguide.registry import ALGORITHMS, algorithm
 from tests.conftest import assert_same_parameters
 from tests.loop_transport import LoopTransport, timeout
 

@@ -11,7 +11,7 @@ import fed_envs
 from fed_envs import registration
 from fed_envs.metadata import parse_family
 from sb3_fedguide.cli.main import main
-from sb3_fedguide.cli.names import nearest
+from sb3_fedguide.settings.names import nearest
 
 FLAGS = ["--num-threads", "--env", "--algo", "--n-timesteps", "--eval-freq", "--progress"]
 

@@ -6,7 +6,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_fedguide.common.stacked import fixed_forward, stack_module
+from sb3_fedguide.state.stacked import fixed_forward, stack_module
 
 
 def perturbed(*layers: nn.Module, n_clients: int = 3) -> nn.Sequential:

@@ -17,9 +17,9 @@ import pytest
 import yaml
 
 import fed_envs
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli import benchmark_runs, tune
 from sb3_fedguide.cli.tune_arguments import parse_tune
+from sb3_fedguide.registry import ALGORITHMS
 
 optuna = pytest.importorskip("optuna")
 
@@ -126,7 +126,7 @@ def test_a_grid_tries_every_combination_once_and_goes_on(quick, tmp_path, capfd)
 
 
 def test_the_best_settings_are_a_configuration(quick, tmp_path):
-    from sb3_fedguide.cli.config import resolve
+    from sb3_fedguide.settings.config import resolve
 
     assert quick("--sampler", "grid", "--n-trials", "1") == 0
     config = resolve("fedprox", fed_envs.load_family("Bandit2D"), "out/Bandit2D-fedprox/best.yml")
@@ -227,8 +227,8 @@ def test_without_optuna_one_line_says_what_to_install(quick, capfd, monkeypatch)
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_default_space_holds_known_settings_in_range(algo):
-    from sb3_fedguide.cli.config import resolve
     from sb3_fedguide.cli.tune_space import default_space
+    from sb3_fedguide.settings.config import resolve
 
     space = default_space(algo, {})
     assert {"learning_rate"} <= space.entries.keys() and max(map(len, space.entries.values())) <= 3  # type: ignore[arg-type]

@@ -12,10 +12,10 @@ import torch as th
 
 from fed_envs.faults import ClientError
 from sb3_fedguide import FedAvg, FedGuide, FedKL, FedRL, FedSVRPGM
-from sb3_fedguide.algorithms import algorithm
 from sb3_fedguide.cli.recorder import CostCallback
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.priors import GaussianPrior, active_experts, mixture_log_prob
+from sb3_fedguide.registry import algorithm
 from sb3_fedguide.server.averaging import Averaging, combine, weighted_average
 from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW, OTMoE
 from sb3_fedguide.server.strategy import N_SAMPLES, Composite

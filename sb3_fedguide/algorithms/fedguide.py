@@ -16,8 +16,6 @@ from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.parameter_averaging import ParameterAveraging
 from sb3_fedguide.common.rollout_buffer import FederatedSamples, generalized_advantage
-from sb3_fedguide.common.seeding import Role
-from sb3_fedguide.common.stacked import to_arrays, to_tensors
 from sb3_fedguide.common.value_blend import baseline_figures, optimal_blend
 from sb3_fedguide.offline.dice import DiceValue, calibrate
 from sb3_fedguide.offline.pretraining import Pretraining
@@ -25,8 +23,10 @@ from sb3_fedguide.priors.adaptation import HeadAdaptation
 from sb3_fedguide.priors.base import Prior, score_cost
 from sb3_fedguide.priors.importance import importance_weights
 from sb3_fedguide.priors.mixture import mixture_log_prob, mixture_sample
+from sb3_fedguide.seeding import Role
 from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW
 from sb3_fedguide.server.strategy import Payload
+from sb3_fedguide.state.stacked import to_arrays, to_tensors
 
 #: Raw actions further outside the action box than this get no importance weight: no behaviour data can lie there.
 ACTION_MARGIN = 0.1

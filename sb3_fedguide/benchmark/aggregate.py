@@ -14,7 +14,7 @@ from gymnasium import spaces
 from fed_envs import Family, FederatedVecEnv
 from sb3_fedguide.benchmark.bootstrap import RESAMPLES, percentile_interval, resample
 from sb3_fedguide.common.evaluation import Evaluation, evaluate_federation
-from sb3_fedguide.common.seeding import EVALUATION_SEED, Role
+from sb3_fedguide.seeding import EVALUATION_SEED, Role
 
 
 @dataclass(frozen=True)

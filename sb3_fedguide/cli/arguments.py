@@ -7,8 +7,8 @@ import re
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.engines import ENGINES
+from sb3_fedguide.registry import ALGORITHMS
 
 #: Libraries that ``--track`` takes; each is the package of that name and an extra of this one.
 TRACKERS = ("trackio", "wandb")
@@ -25,7 +25,7 @@ class OneLineParser(argparse.ArgumentParser):
         """Parse, and name the nearest flag for one that there is not."""
         arguments, unknown = self.parse_known_args(argv)
         if unknown:
-            from sb3_fedguide.cli.names import nearest
+            from sb3_fedguide.settings.names import nearest
 
             flags = [option for action in self._actions for option in action.option_strings]
             self.error(f"unknown argument {unknown[0]!r}.{nearest(unknown[0].split('=')[0], flags)}")

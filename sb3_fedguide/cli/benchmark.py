@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.benchmark_arguments import PASSED_ON, SETTINGS, check_methods, parse_benchmark, train_flags
 from sb3_fedguide.cli.output import pipe_may_close
@@ -22,13 +21,14 @@ from sb3_fedguide.cli.train import (
     import_packages,
     prepare,
 )
+from sb3_fedguide.registry import ALGORITHMS
 
 if TYPE_CHECKING:
     from fed_envs import Family
     from sb3_fedguide.benchmark.results import Result
     from sb3_fedguide.cli.benchmark_runs import BenchmarkRun, Outcome
     from sb3_fedguide.cli.benchmark_tables import Tables
-    from sb3_fedguide.cli.config import Config
+    from sb3_fedguide.settings.config import Config
 
 SEEDS = (0, 1, 2, 3, 4)
 #: Inside the folder of a family's results: what runs need to go on.
@@ -166,7 +166,7 @@ def _check_earlier(run: BenchmarkRun, family: Family, config: Config, n_episodes
     """:raises ValueError: if the run has been done, or begun, with other settings than those that are asked for"""
     from sb3_fedguide.benchmark.results import read_result
     from sb3_fedguide.cli.benchmark_runs import interrupted_folder
-    from sb3_fedguide.cli.config import read_yaml
+    from sb3_fedguide.settings.config import read_yaml
 
     now = {**config.values, "clients": family.content_hash}
     if run.result.is_file():

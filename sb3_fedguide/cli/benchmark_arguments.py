@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import OneLineParser, train_parser
-from sb3_fedguide.cli.names import check_names
+from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.settings.names import check_names
 
 #: Flags of the training command that say what a run computes, and that a run which goes on has in its own settings.
 SETTINGS = ("dataset", "rounds", "n_envs_per_client", "conf_file", "hyperparams")

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sb3_fedguide.cli.config import read_yaml
 from sb3_fedguide.cli.resume import finished_rounds
 from sb3_fedguide.cli.run_folder import exclusive
 from sb3_fedguide.cli.signals import StopSignals
 from sb3_fedguide.cli.status import read_status
+from sb3_fedguide.settings.config import read_yaml
 
 #: The training command; a run's flags follow.
 TRAIN = (sys.executable, "-m", "sb3_fedguide", "train")

@@ -17,7 +17,7 @@ def read_delays(given: str) -> DelaySettings:
     try:
         if Path(given).suffix not in (".yml", ".yaml"):
             return parse_delays(given)
-        from sb3_fedguide.cli.config import read_yaml
+        from sb3_fedguide.settings.config import read_yaml
 
         values = read_yaml(Path(given))
         if not isinstance(values, dict):

@@ -13,8 +13,8 @@ from sb3_fedguide.cli.output import pipe_may_close
 if TYPE_CHECKING:
     from fed_envs import Family
     from sb3_fedguide.benchmark.bandit2d import MethodResult
-    from sb3_fedguide.cli.config import Config
     from sb3_fedguide.common.federated_ppo import FederatedPPO
+    from sb3_fedguide.settings.config import Config
 
 #: Trained in this order; Local is drawn as a curve only.
 METHODS = {"Local": "local", "FedAvg": "fedavg", "FedGuide": "fedguide"}
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _configs(conf_file: str, rounds: int | None) -> dict[str, Config]:
     from fed_envs import load_family
-    from sb3_fedguide.cli.config import resolve
+    from sb3_fedguide.settings.config import resolve
 
     family, overrides = load_family("Bandit2D"), {} if rounds is None else {"n_rounds": rounds}
     return {name: resolve(algo, family, conf_file, overrides=overrides) for name, algo in METHODS.items()}

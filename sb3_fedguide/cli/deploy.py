@@ -19,7 +19,7 @@ from sb3_fedguide.cli.run_folder import exclusive, write_json
 from sb3_fedguide.cli.signals import StopSignals
 
 if TYPE_CHECKING:
-    from sb3_fedguide.cli.deploy_config import ClientDeployment
+    from sb3_fedguide.deployment.files import ClientDeployment
 
 #: In a deployment's folder, what its processes are told.
 CONFIG = "config.json"
@@ -75,14 +75,14 @@ def _parser() -> OneLineParser:
 
 def _check_installation() -> None:
     try:
-        from sb3_fedguide.flower.processes import check_flower_version
+        from sb3_fedguide.deployment.flower.processes import check_flower_version
     except ModuleNotFoundError as error:
         raise ValueError(f"{error.name} is not installed: pip install 'sb3-fedguide[flower]'") from None
     check_flower_version()
 
 
 def _certificates(arguments: argparse.Namespace) -> int:
-    from sb3_fedguide.flower.certificates import CA, write_certificates
+    from sb3_fedguide.deployment.flower.certificates import CA, write_certificates
 
     if arguments.days < 1:
         raise ValueError(f"--days must be at least 1, not {arguments.days}")
@@ -92,7 +92,7 @@ def _certificates(arguments: argparse.Namespace) -> int:
 
 
 def _key(arguments: argparse.Namespace) -> int:
-    from sb3_fedguide.flower.certificates import write_key
+    from sb3_fedguide.deployment.flower.certificates import write_key
 
     private, public = write_key(arguments.folder, arguments.name)
     print(f"{private} stays on this machine; the server needs {public}:\n{public.read_text().strip()}")
@@ -100,8 +100,8 @@ def _key(arguments: argparse.Namespace) -> int:
 
 
 def _server(arguments: argparse.Namespace) -> int:
-    from sb3_fedguide.cli.deploy_config import ServerDeployment
-    from sb3_fedguide.flower.server_node import ServerNode
+    from sb3_fedguide.deployment.files import ServerDeployment
+    from sb3_fedguide.deployment.flower.server_node import ServerNode
 
     deployment = ServerDeployment(arguments.config)
     config = _prepare(deployment.folder)
@@ -114,9 +114,9 @@ def _server(arguments: argparse.Namespace) -> int:
 
 
 def _client(arguments: argparse.Namespace) -> int:
-    from sb3_fedguide.cli.deploy_config import ClientDeployment
-    from sb3_fedguide.cli.site_config import read_site_config
-    from sb3_fedguide.flower.client_node import ClientNode
+    from sb3_fedguide.deployment.files import ClientDeployment
+    from sb3_fedguide.deployment.flower.client_node import ClientNode
+    from sb3_fedguide.deployment.site_config import read_site_config
 
     deployment = ClientDeployment(arguments.config)
     read_site_config(deployment.site)
@@ -162,7 +162,7 @@ def _check_server(deployment: ClientDeployment) -> None:
 
 
 def _try_site(deployment: ClientDeployment) -> None:
-    from sb3_fedguide.common.site import SITE, make_site
+    from sb3_fedguide.deployment.site import SITE, make_site
 
     make_site(deployment.site, deployment.folder / SITE)
 

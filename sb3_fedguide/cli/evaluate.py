@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
     from fed_envs import Family
-    from sb3_fedguide.cli.config import Config
     from sb3_fedguide.common.evaluation import Evaluation
     from sb3_fedguide.common.federation import Federation
+    from sb3_fedguide.settings.config import Config
 
 #: A picture file's frames: more would make it unwieldy.
 MAX_FRAMES = 200
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide evaluate") -> 
 
 
 def _parser(prog: str) -> OneLineParser:
-    from sb3_fedguide.common.seeding import EVALUATION_SEED
+    from sb3_fedguide.seeding import EVALUATION_SEED
 
     parser = OneLineParser(prog=prog, description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     flag = parser.add_argument
@@ -80,7 +80,7 @@ def _parser(prog: str) -> OneLineParser:
 
 def _read_run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Config, Family]:
     """:raises ValueError: if the folder is none of a trained run, or its algorithm or world needs a module to be imported"""
-    from sb3_fedguide.cli.config import read_yaml
+    from sb3_fedguide.settings.config import read_yaml
 
     folder = Path(arguments.run)
     try:

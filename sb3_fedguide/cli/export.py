@@ -63,8 +63,8 @@ def _export(arguments: argparse.Namespace) -> Iterator[Path]:
 
 
 def _parameter_file(path: Path) -> Path:
-    from sb3_fedguide.common.checkpoint_files import checkpoints
-    from sb3_fedguide.common.site import SITE
+    from sb3_fedguide.deployment.site import SITE
+    from sb3_fedguide.state.checkpoint_files import checkpoints
 
     for candidate in (path, path / PARAMETERS, path / SITE / PARAMETERS):
         if candidate.is_file():

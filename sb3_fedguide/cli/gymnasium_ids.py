@@ -24,7 +24,7 @@ def registered_family(ids: Sequence[str], client_kwargs: str | None, env_kwargs:
     :raises ValueError: for unknown ids, a wrong file, or numbers that do not fit
     """
     from fed_envs.gymnasium_world import gymnasium_family
-    from sb3_fedguide.cli.config import parse_params
+    from sb3_fedguide.settings.config import parse_params
 
     common = parse_params(env_kwargs, "--env-kwargs")
     if client_kwargs is None and len(ids) == 1:
@@ -41,7 +41,7 @@ def registered_family(ids: Sequence[str], client_kwargs: str | None, env_kwargs:
 
 
 def _read(path: Path) -> list[dict[str, Any]]:
-    from sb3_fedguide.cli.config import read_yaml
+    from sb3_fedguide.settings.config import read_yaml
 
     content = read_yaml(path)
     entries = [{} if entry is None else entry for entry in content] if isinstance(content, list) else []

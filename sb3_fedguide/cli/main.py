@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 
-from sb3_fedguide.cli.names import nearest
 from sb3_fedguide.cli.output import pipe_may_close
+from sb3_fedguide.settings.names import nearest
 
 USAGE = """usage: fedguide COMMAND ...
 

@@ -10,13 +10,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import OneLineParser
 from sb3_fedguide.cli.benchmark_arguments import benchmark_parser, check_methods, parse_benchmark
-from sb3_fedguide.cli.names import check_names
 from sb3_fedguide.cli.output import pipe_may_close
 from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, one_message
 from sb3_fedguide.cli.train import import_packages
+from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.settings.names import check_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.benchmark.figures.runs import Comparison, Run, bytes_at, from_result, seconds_at
 from sb3_fedguide.benchmark.results import Result, check_comparable, parse_result
 from sb3_fedguide.cli.benchmark import benchmark_results, no_results
 from sb3_fedguide.cli.run_folder import EVALUATIONS
+from sb3_fedguide.registry import ALGORITHMS
 
 if TYPE_CHECKING:
     from fed_envs import Family
@@ -108,7 +108,7 @@ def _identity(folder: Path) -> tuple[dict[str, Any], Result | None]:
             content = json.loads(path.read_text(encoding="utf-8"))
             result = parse_result(path, content) if content["finished"] is True else None
             return {"algo": str(content["algo"]), "env": str(content["env"]), "seed": int(content["seed"])}, result
-        from sb3_fedguide.cli.config import read_yaml
+        from sb3_fedguide.settings.config import read_yaml
 
         path = folder / "args.yml"  # a run that still goes on, or was killed
         flags = read_yaml(path)

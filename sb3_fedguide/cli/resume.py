@@ -11,13 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import train_parser
-from sb3_fedguide.cli.names import check_names
+from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.settings.names import check_names
 
 if TYPE_CHECKING:
     from fed_envs import Family
-    from sb3_fedguide.cli.config import Config
+    from sb3_fedguide.settings.config import Config
 
 #: Flags that change nothing in what a run computes, so that they may differ from the run's own.
 FREE = ("verbose", "progress", "save_freq", "picture_freq", "num_threads", "cache_dir", "gym_packages", "resume", "engine",
@@ -94,7 +94,7 @@ def _comparable(name: str, value: Any) -> Any:
 
 
 def _read_yaml(folder: Path, name: str) -> dict[str, Any]:
-    from sb3_fedguide.cli.config import read_yaml
+    from sb3_fedguide.settings.config import read_yaml
 
     if not (folder / name).is_file():
         raise ValueError(
@@ -112,7 +112,7 @@ def read_settings(folder: Path, algo: str) -> tuple[Config, Family]:
     :raises ValueError: where one of its files is missing or damaged
     """
     from fed_envs.metadata import read_family
-    from sb3_fedguide.cli.config import Config, complete
+    from sb3_fedguide.settings.config import Config, complete
 
     check_names([algo], ALGORITHMS, "algorithm")
     try:
@@ -126,7 +126,7 @@ def read_settings(folder: Path, algo: str) -> tuple[Config, Family]:
 
 def with_length(config: Config, family: Family, given: Mapping[str, Any]) -> Config:
     """The run's settings with the length that is given now, if one is."""
-    from sb3_fedguide.cli.config import rounds_of
+    from sb3_fedguide.settings.config import rounds_of
 
     n_rounds = given.get("rounds")
     if given.get("n_timesteps") is not None:
@@ -137,7 +137,7 @@ def with_length(config: Config, family: Family, given: Mapping[str, Any]) -> Con
 def check_length(folder: Path, config: Config, done: int) -> None:
     """:raises ValueError: where the run has had more rounds than it is to have, or cannot have more"""
     from sb3_fedguide.cli.run_folder import CHECKPOINTS
-    from sb3_fedguide.common.checkpoint_files import checkpoints
+    from sb3_fedguide.state.checkpoint_files import checkpoints
 
     if config.n_rounds < done:
         raise ValueError(f"the run in {folder} has had {done} rounds, so it cannot be one of {config.n_rounds}")

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from stable_baselines3.common.logger import TensorBoardOutputFormat
 
     from fed_envs import Family
-    from sb3_fedguide.cli.config import Config
     from sb3_fedguide.cli.tracking import TrackerOutputFormat
     from sb3_fedguide.common.callbacks import RoundCallback
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
+    from sb3_fedguide.settings.config import Config
 
 EXIT_FAILED, EXIT_USAGE = 1, 2
 LONGEST_MESSAGE = 2000
@@ -119,8 +119,8 @@ class Run:
 
     def _record_length(self, folder: Path) -> None:
         """A run that goes on may be longer than it was to be, also when it goes on once more."""
-        from sb3_fedguide.cli.config import read_yaml
         from sb3_fedguide.cli.run_folder import write_yaml
+        from sb3_fedguide.settings.config import read_yaml
 
         if read_yaml(folder / "config.yml")["n_rounds"] == self.config.n_rounds:
             return
@@ -206,10 +206,10 @@ class Run:
         )
 
     def _monitoring(self) -> list[RoundCallback]:
-        from sb3_fedguide.cli.schema import all_names
         from sb3_fedguide.monitoring.callbacks import TensorBoardCallback
         from sb3_fedguide.monitoring.diagnostics import DiagnosticsCallback
         from sb3_fedguide.monitoring.health import HealthCallback
+        from sb3_fedguide.settings.schema import all_names
 
         shown = {"algo": self.arguments.algo, "family": self.family.name, "seed": self.model.seed, **self.config.values}
         pictures = TensorBoardCallback(self.config.n_rounds, self.arguments.picture_freq, shown, all_names())

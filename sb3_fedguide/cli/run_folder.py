@@ -114,7 +114,7 @@ def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
 
 def write_deployed(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """The policies that the clients deploy, as plain arrays beside the saved model; complete or not at all."""
-    from sb3_fedguide.common.array_files import write_arrays
+    from sb3_fedguide.state.array_files import write_arrays
 
     write_arrays(folder / DEPLOYED, arrays)
 
@@ -124,7 +124,7 @@ def read_deployed(folder: Path) -> dict[str, np.ndarray]:
 
     :raises ValueError: if the file is damaged
     """
-    from sb3_fedguide.common.array_files import load_arrays
+    from sb3_fedguide.state.array_files import load_arrays
 
     return load_arrays(folder / DEPLOYED) if (folder / DEPLOYED).is_file() else {}
 

@@ -6,14 +6,14 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_fedguide.algorithms import ALGORITHMS
+from sb3_fedguide.registry import ALGORITHMS
 
 if TYPE_CHECKING:
     import numpy as np
 
     from fed_envs import Family
-    from sb3_fedguide.cli.config import Config
     from sb3_fedguide.common.federation import Federation
+    from sb3_fedguide.settings.config import Config
 
 
 def read_run(folder: Path) -> tuple[dict[str, Any], Config, Family]:
@@ -40,7 +40,7 @@ def read_run(folder: Path) -> tuple[dict[str, Any], Config, Family]:
 
 def _remedy(folder: Path, missing: str) -> str:
     """What to do about a deployed client's folder, and about the runs of earlier versions, which kept SB3's archive only."""
-    from sb3_fedguide.common.site import PARAMETERS, SITE
+    from sb3_fedguide.deployment.site import PARAMETERS, SITE
 
     if missing == "summary.json" and any((place / PARAMETERS).is_file() for place in (folder, folder / SITE)):
         return "; it is a deployed client's, of whose policy 'fedguide export' makes an ordinary one to evaluate"
@@ -76,7 +76,7 @@ def read_deployed_policies(folder: Path, model: Federation) -> dict[str, np.ndar
     import numpy as np
 
     from sb3_fedguide.cli.run_folder import DEPLOYED, read_deployed
-    from sb3_fedguide.common.array_files import array_mismatches
+    from sb3_fedguide.state.array_files import array_mismatches
 
     deployed = read_deployed(folder)
     if deployed and (mismatches := array_mismatches(deployed, model.acting_arrays())):

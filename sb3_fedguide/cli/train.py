@@ -16,10 +16,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.gymnasium_ids import is_registered, registered_family
-from sb3_fedguide.cli.names import check_names
 from sb3_fedguide.cli.output import pipe_may_close
 from sb3_fedguide.cli.resume import (
     check_length,
@@ -31,12 +29,14 @@ from sb3_fedguide.cli.resume import (
     with_length,
 )
 from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, Run, one_message
+from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.settings.names import check_names
 
 if TYPE_CHECKING:
     from fed_envs import Family
-    from sb3_fedguide.cli.config import Config
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
+    from sb3_fedguide.settings.config import Config
 
 EXIT_INTERRUPTED = 130
 PACKAGE = Path(__file__).parents[1]
@@ -196,10 +196,10 @@ def check_before_imports(arguments: argparse.Namespace) -> None:
 
     :raises ValueError: for what is wrong
     """
-    from sb3_fedguide.cli.config import config_path, parse_params, read_config
     from sb3_fedguide.cli.delays import read_delays
     from sb3_fedguide.cli.run_folder import check_log_folder, parameter_file
     from sb3_fedguide.offline.cache import cache_folder, check_cache_folder
+    from sb3_fedguide.settings.config import config_path, parse_params, read_config
 
     check_names([arguments.algo], ALGORITHMS, "algorithm")
     if arguments.engine == "ray" and importlib.util.find_spec("ray") is None:
@@ -228,7 +228,7 @@ def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
 
     :raises ValueError: where two of them say the same thing
     """
-    from sb3_fedguide.cli.config import parse_params
+    from sb3_fedguide.settings.config import parse_params
 
     given = parse_params(arguments.hyperparams)
     flags = {
@@ -256,7 +256,7 @@ def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
 
     :raises ValueError: for anything that a user can put right
     """
-    from sb3_fedguide.cli.config import resolve
+    from sb3_fedguide.settings.config import resolve
 
     given = overrides(arguments)
     entry = settings_entry(arguments)

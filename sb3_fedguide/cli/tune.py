@@ -14,10 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.benchmark_arguments import train_flags
-from sb3_fedguide.cli.names import check_names
 from sb3_fedguide.cli.output import pipe_may_close
 from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, one_message
 from sb3_fedguide.cli.train import (
@@ -29,15 +27,17 @@ from sb3_fedguide.cli.train import (
     prepare,
 )
 from sb3_fedguide.cli.tune_arguments import N_TRIALS, PASSED_ON, SETTINGS, parse_tune
+from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.settings.names import check_names
 
 if TYPE_CHECKING:
     import optuna
 
     from fed_envs import Family
-    from sb3_fedguide.cli.config import Config
     from sb3_fedguide.cli.signals import StopSignals
     from sb3_fedguide.cli.tune_space import Space
     from sb3_fedguide.cli.tune_trials import ActiveTrial
+    from sb3_fedguide.settings.config import Config
 
 #: Trials that fail before the first one works, after which no more are begun.
 MAX_FAILURES = 3

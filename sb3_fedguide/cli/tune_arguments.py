@@ -6,9 +6,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.cli.arguments import OneLineParser, train_parser
 from sb3_fedguide.cli.benchmark_arguments import check_seeds_and_processes
+from sb3_fedguide.registry import ALGORITHMS
 
 #: Flags of the training command that say what a run computes.
 SETTINGS = (

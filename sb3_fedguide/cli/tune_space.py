@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
+from sb3_fedguide.registry import ALGORITHMS, algorithm
 
 if TYPE_CHECKING:
     import optuna
@@ -114,7 +114,7 @@ def read_space(path: Path, fixed: Mapping[str, Any]) -> Space:
 
     :raises ValueError: for a file that cannot be read or is no space, or what is ``fixed`` as well
     """
-    from sb3_fedguide.cli.config import read_yaml
+    from sb3_fedguide.settings.config import read_yaml
 
     if not path.is_file():
         raise ValueError(f"--search: there is no file {path}")

@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_fedguide.common.normalization import Normalize
-from sb3_fedguide.offline.config import PretrainingConfig
+from sb3_fedguide.settings.pretraining import PretrainingConfig
 
 
 class FederationArguments(TypedDict, total=False):

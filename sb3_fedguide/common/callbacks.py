@@ -80,7 +80,8 @@ def round_callbacks(callback: BaseCallback | None) -> Iterator[RoundCallback]:
 class ExchangeCallback(RoundCallback):
     """Plays the server in process: carries uploads to the model's ``strategy`` and broadcasts back.
 
-    Over a network :func:`sb3_fedguide.server.serve.serve` takes its place; clients, strategy and :class:`Rounds` are the same.
+    Over a network :func:`sb3_fedguide.deployment.serve.serve` takes its place; clients, strategy and :class:`Rounds` are
+    the same.
     """
 
     state_attributes = ("bytes_counted",)

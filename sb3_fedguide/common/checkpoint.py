@@ -1,4 +1,4 @@
-"""Checkpoints of a run: written while it trains, files of :mod:`sb3_fedguide.common.checkpoint_files`."""
+"""Checkpoints of a run: written while it trains, files of :mod:`sb3_fedguide.state.checkpoint_files`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fed_envs.state import State
 from sb3_fedguide.common.callbacks import RoundCallback
-from sb3_fedguide.common.checkpoint_files import (
+from sb3_fedguide.state.checkpoint_files import (
     KEPT,
     checkpoints,
     newest_checkpoint,

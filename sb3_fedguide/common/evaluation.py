@@ -16,7 +16,7 @@ from fed_envs.faults import ClientError
 from fed_envs.state import State, freeze, thaw
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.episodes import truth
-from sb3_fedguide.common.seeding import EVALUATION_SEED, Role
+from sb3_fedguide.seeding import EVALUATION_SEED, Role
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation

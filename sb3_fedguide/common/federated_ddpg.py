@@ -29,9 +29,9 @@ from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
 from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.replay_buffer import FederatedReplayBuffer
-from sb3_fedguide.common.seeding import Role, integer_seed
 from sb3_fedguide.common.training_log import RoundStatistics
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
+from sb3_fedguide.seeding import Role, integer_seed
 from sb3_fedguide.server.validation import UPLOAD_BOUND
 from sb3_fedguide.settings.ranges import check_ranges
 

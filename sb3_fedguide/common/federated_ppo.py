@@ -26,12 +26,12 @@ from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 from sb3_fedguide.common.rollout_buffer import FederatedRolloutBuffer, FederatedSamples, check_sizes, generalized_advantage
-from sb3_fedguide.common.seeding import Role, integer_seed
-from sb3_fedguide.common.stacked import clip_grad_norm_per_client
 from sb3_fedguide.common.training_log import RoundStatistics, record_training
 from sb3_fedguide.offline.pretraining import PretrainingConfig
+from sb3_fedguide.seeding import Role, integer_seed
 from sb3_fedguide.server.validation import UPLOAD_BOUND
 from sb3_fedguide.settings.ranges import check_ranges
+from sb3_fedguide.state.stacked import clip_grad_norm_per_client
 
 
 class FederatedPPO(Federation, PPO):

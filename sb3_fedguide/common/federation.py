@@ -28,9 +28,9 @@ from sb3_fedguide.common.parameters import ParameterFiles
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 from sb3_fedguide.common.resumable import Resumable
-from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.common.warm_start import WarmStart
 from sb3_fedguide.offline.pretraining import PretrainingConfig
+from sb3_fedguide.seeding import Role, stream
 from sb3_fedguide.server.participants import draw_participants, n_participants
 from sb3_fedguide.server.strategy import Strategy
 from sb3_fedguide.server.validation import UPLOAD_BOUND

@@ -16,11 +16,11 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule
 from torch import nn
 
 from fed_envs.files import atomic_file
-from sb3_fedguide.common.array_files import array_mismatches, read_arrays, write_arrays
 from sb3_fedguide.common.export import SETTINGS, ClientPolicies, ClientPolicy, Normalization, client_settings
 from sb3_fedguide.common.normalization import Normalize
 from sb3_fedguide.common.spaces import describe_space, space_from
-from sb3_fedguide.common.stacked import client_state, to_arrays, to_tensors
+from sb3_fedguide.state.array_files import array_mismatches, read_arrays, write_arrays
+from sb3_fedguide.state.stacked import client_state, to_arrays, to_tensors
 
 FORMAT, VERSION = "sb3_fedguide parameters", 1
 HEADER = "header"

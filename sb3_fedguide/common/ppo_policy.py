@@ -14,9 +14,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_fedguide.common.distributions import action_distribution
-from sb3_fedguide.common.stacked import fixed_forward, stack_tensor
 from sb3_fedguide.common.stacked_policy import StackedPolicy, check_observations
 from sb3_fedguide.server.payload import PPO_ACTOR, PPO_CRITIC
+from sb3_fedguide.state.stacked import fixed_forward, stack_tensor
 
 ACTOR_PREFIXES, CRITIC_PREFIXES = PPO_ACTOR, PPO_CRITIC
 

@@ -13,14 +13,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fed_envs import FederatedVecEnv
 from fed_envs.state import State, declared_state, freeze, load_declared, thaw
-from sb3_fedguide.common.array_files import array_mismatches
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointError, newest_checkpoint
 from sb3_fedguide.common.normalization import FederatedNormalizer
-from sb3_fedguide.common.optimizer_state import load_optimizer, optimizer_state
-from sb3_fedguide.common.stacked import to_arrays, to_tensors
 from sb3_fedguide.server.delays import Delays
 from sb3_fedguide.server.strategy import Strategy
+from sb3_fedguide.state.array_files import array_mismatches
+from sb3_fedguide.state.optimizer_state import load_optimizer, optimizer_state
+from sb3_fedguide.state.stacked import to_arrays, to_tensors
 
 SelfResumable = TypeVar("SelfResumable", bound="Resumable")
 

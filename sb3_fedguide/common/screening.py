@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sb3_fedguide.common.evaluation import evaluate_federation, evaluation_env
-from sb3_fedguide.common.seeding import Role, stream
+from sb3_fedguide.seeding import Role, stream
 from sb3_fedguide.server.strategy import Payload
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
-from sb3_fedguide.common.stacked import client_state, stack_module
+from sb3_fedguide.state.stacked import client_state, stack_module
 
 
 class StackedPolicy(BasePolicy):

@@ -14,8 +14,8 @@ from fed_envs.state import State
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.faults import warn_of_new_episodes
 from sb3_fedguide.common.federation import Federation
-from sb3_fedguide.engines.client_axis import join_clients, take_clients
 from sb3_fedguide.engines.worker import Round, Trained, describe
+from sb3_fedguide.state.client_axis import join_clients, take_clients
 
 
 class EngineError(RuntimeError):

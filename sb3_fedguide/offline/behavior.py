@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 
 from fed_envs.files import atomic_file
-from sb3_fedguide.common.array_files import load_arrays
+from sb3_fedguide.state.array_files import load_arrays
 
 __all__ = ["BehaviorPolicy", "behavior_policy", "squash"]
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fed_envs.files import current_umask
-from sb3_fedguide.common.array_files import array_mismatches, arrays_hash, read_arrays, write_arrays
+from sb3_fedguide.state.array_files import array_mismatches, arrays_hash, read_arrays, write_arrays
 
 __all__ = [
     "arrays_hash", "cache_folder", "cached_arrays", "check_cache_folder", "content_key", "keep_arrays", "publish_folder",

@@ -11,9 +11,9 @@ import numpy as np
 from fed_envs import Family, FederatedVecEnv
 from fed_envs.registration import environment_class
 from fed_envs.world import ScriptedPolicy
-from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.behavior import BehaviorPolicy, behavior_policy
 from sb3_fedguide.offline.data import OfflineData
+from sb3_fedguide.seeding import Role, stream
 
 __all__ = ["DATA_VERSION", "behavior_name", "check_source", "collect", "default_size", "source_key"]
 

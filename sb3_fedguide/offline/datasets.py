@@ -11,7 +11,6 @@ import gymnasium as gym
 import numpy as np
 
 from fed_envs import Family, load_family
-from sb3_fedguide.common.seeding import Role, stream
 from sb3_fedguide.offline.behavior import BehaviorPolicy
 from sb3_fedguide.offline.cache import (
     cache_folder,
@@ -25,6 +24,7 @@ from sb3_fedguide.offline.collect import behavior_name, collect, default_size, s
 from sb3_fedguide.offline.data import OfflineData, normalize_observations
 from sb3_fedguide.offline.minari_io import check_spaces, find_dataset, read_minari, write_minari
 from sb3_fedguide.offline.progress import StepProgress
+from sb3_fedguide.seeding import Role, stream
 
 __all__ = ["OfflineData", "client_datasets", "dataset_folder", "normalize_observations"]
 

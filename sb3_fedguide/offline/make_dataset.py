@@ -160,7 +160,7 @@ def _checked_actions(actions: np.ndarray, space: gym.Space) -> gym.spaces.Box:
 
 
 def _npz(path: Path, names: Mapping[str, Sequence[str]]) -> dict[str, np.ndarray]:
-    from sb3_fedguide.common.array_files import load_arrays
+    from sb3_fedguide.state.array_files import load_arrays
 
     try:
         arrays = load_arrays(path)

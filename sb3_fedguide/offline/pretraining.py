@@ -21,18 +21,18 @@ from torch import nn
 
 from fed_envs import Family, load_family
 from sb3_fedguide.common.parameters import take_prefix
-from sb3_fedguide.common.seeding import Role, stream
-from sb3_fedguide.common.stacked import to_tensors
 from sb3_fedguide.offline.behavior_cloning import clone
 from sb3_fedguide.offline.cache import arrays_hash, cache_folder, cached_arrays, content_key, keep_arrays
 from sb3_fedguide.offline.collect import check_source
-from sb3_fedguide.offline.config import Piece, PretrainingConfig
 from sb3_fedguide.offline.datasets import OfflineData, client_datasets, normalize_observations
 from sb3_fedguide.offline.dice import DiceValue, train_dice
 from sb3_fedguide.offline.progress import Progress, TqdmProgress, stage_progress
 from sb3_fedguide.offline.trunk import TrunkTraining, federated_trunk
 from sb3_fedguide.priors import DiffusionPrior, GaussianPrior, HeadStatistics, Prior
+from sb3_fedguide.seeding import Role, stream
 from sb3_fedguide.server.trunk import MOMENTS, TRUNK
+from sb3_fedguide.settings.pretraining import Piece, PretrainingConfig
+from sb3_fedguide.state.stacked import to_tensors
 
 __all__ = ["PretrainedPrior", "Pretraining", "PretrainingConfig", "untrained_prior"]
 

@@ -18,14 +18,14 @@ import torch as th
 from torch import nn
 
 from fed_envs.plain_data import State, freeze, thaw
-from sb3_fedguide.common.optimizer_state import load_optimizer, optimizer_state
-from sb3_fedguide.common.stacked import StackedLinear, client_state, stack_module, to_arrays, to_tensors
 from sb3_fedguide.offline.groups import client_groups, train_together
 from sb3_fedguide.offline.progress import StepProgress
 from sb3_fedguide.priors.density import training_angle
 from sb3_fedguide.priors.diffusion import DiffusionPrior
 from sb3_fedguide.priors.trunk_network import DiffusionTrunk
 from sb3_fedguide.server.trunk import average_uploads, merge_moments
+from sb3_fedguide.state.optimizer_state import load_optimizer, optimizer_state
+from sb3_fedguide.state.stacked import StackedLinear, client_state, stack_module, to_arrays, to_tensors
 
 __all__ = [
     "TrunkResult",

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
-from sb3_fedguide.common.seeding import Role, seed_sequence
+from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.seeding import Role, seed_sequence
 from sb3_fedguide.server.averaging import Averaging, averaged_prefixes, check_averaging
 from sb3_fedguide.server.moments import ObservationMoments
 from sb3_fedguide.server.ot_moe import OTMoE

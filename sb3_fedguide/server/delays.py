@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from fed_envs.plain_data import State, freeze, thaw
-from sb3_fedguide.common.seeding import Role, stream
+from sb3_fedguide.seeding import Role, stream
 from sb3_fedguide.server.rounds import participants
 
 #: What the server waits for, see :class:`DelaySettings`.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sb3_fedguide.common.seeding import Role, stream
+from sb3_fedguide.seeding import Role, stream
 
 
 def n_participants(client_fraction: float, n_clients: int) -> int:

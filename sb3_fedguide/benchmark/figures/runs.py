@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_fedguide.algorithms import ALGORITHMS
 from sb3_fedguide.benchmark.results import Result
+from sb3_fedguide.registry import ALGORITHMS
 
 #: What a learning curve can be drawn over.
 AXES = ("rounds", "steps", "seconds", "bytes")

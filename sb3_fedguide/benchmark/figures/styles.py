@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_fedguide.algorithms import ALGORITHMS
+from sb3_fedguide.registry import ALGORITHMS
 
 #: M. Okabe and K. Ito, Color universal design, 2008; without their yellow, which is too light for lines on paper.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"

@@ -15,7 +15,7 @@ from types import TracebackType
 
 from flwr.supercore.interceptors import RuntimeVersionHttpInterceptor
 
-from sb3_fedguide.flower.certificates import LOOPBACK
+from sb3_fedguide.deployment.flower.certificates import LOOPBACK
 
 #: The deployment uses what is no public interface of Flower, and is tested with these releases only.
 FLOWER = "1.41."

@@ -10,9 +10,9 @@ from flwr.app import Context
 from flwr.app import Message as FlowerMessage
 from flwr.clientapp import ClientApp
 
-from sb3_fedguide.common.site import SITE, make_site
-from sb3_fedguide.flower.records import from_records, to_records
-from sb3_fedguide.server.transport import Failure, Message
+from sb3_fedguide.deployment.flower.records import from_records, to_records
+from sb3_fedguide.deployment.site import SITE, make_site
+from sb3_fedguide.deployment.transport import Failure, Message
 
 #: In the client's folder from the federation's end on.
 FINISHED = "finished"

@@ -1,4 +1,4 @@
-"""The server of a real federation: its rounds over any :class:`~sb3_fedguide.server.transport.Transport`.
+"""The server of a real federation: its rounds over any :class:`~sb3_fedguide.deployment.transport.Transport`.
 
 It needs neither PyTorch nor environments nor the clients' metadata: the strategy, NumPy, and a folder for its checkpoints.
 """
@@ -13,15 +13,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from fed_envs.plain_data import State, freeze, thaw
-from sb3_fedguide.common.checkpoint_files import newest_checkpoint, remove_leftovers, write_checkpoint
+from sb3_fedguide.deployment.clients import OF_A_RUN, Clients, difference, server_facts
+from sb3_fedguide.deployment.config import ServerConfig, TooFewClients
+from sb3_fedguide.deployment.metrics import EvaluationTable, count_tests, evaluation_figures, merge_figures, read_evaluations
+from sb3_fedguide.deployment.transport import RUN, UNPREPARED, Failure, Kind, Message, Transport
 from sb3_fedguide.server.build import make_strategy
-from sb3_fedguide.server.clients import OF_A_RUN, Clients, difference, server_facts
-from sb3_fedguide.server.config import ServerConfig, TooFewClients
-from sb3_fedguide.server.figures import EvaluationTable, count_tests, evaluation_figures, merge_figures, read_evaluations
 from sb3_fedguide.server.payload import Payload
 from sb3_fedguide.server.rounds import Rounds, participants, payload_bytes, rejections
-from sb3_fedguide.server.transport import RUN, UNPREPARED, Failure, Kind, Message, Transport
 from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_fault
+from sb3_fedguide.state.checkpoint_files import newest_checkpoint, remove_leftovers, write_checkpoint
 
 logger = logging.getLogger(__name__)
 

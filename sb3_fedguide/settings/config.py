@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
-from sb3_fedguide.cli import schema
-from sb3_fedguide.cli.names import check_names, nearest
+from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.settings import schema
+from sb3_fedguide.settings.names import check_names, nearest
 
 if TYPE_CHECKING:
     from fed_envs import Family
@@ -151,7 +151,7 @@ def complete(given: Mapping[str, Any], algo: str) -> dict[str, Any]:
 
     :raises ValueError: for the first value that is wrong
     """
-    from sb3_fedguide.offline.config import PretrainingConfig
+    from sb3_fedguide.settings.pretraining import PretrainingConfig
 
     parameters = schema.hyperparameters(algorithm(algo))
     _check_keys(given, algo, "the hyperparameters")

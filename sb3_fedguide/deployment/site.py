@@ -14,19 +14,19 @@ from stable_baselines3.common.logger import KVWriter, Logger
 
 import sb3_fedguide
 from fed_envs.plain_data import State, freeze, thaw
-from sb3_fedguide.algorithms import algorithm_name
 from sb3_fedguide.common.callbacks import RoundCallback
-from sb3_fedguide.common.checkpoint_files import newest_checkpoint, remove_leftovers, write_checkpoint
 from sb3_fedguide.common.evaluation import Evaluation, FederatedEvalCallback, evaluation_env
 from sb3_fedguide.common.faults import in_round
 from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.common.parameters import take_prefix
+from sb3_fedguide.deployment.clients import OF_A_RUN, WITH_SERVER, difference
+from sb3_fedguide.deployment.metrics import ClientEvaluation
+from sb3_fedguide.deployment.transport import KINDS, RUN, UNPREPARED, Message
 from sb3_fedguide.offline.trunk import TrunkTraining, observation_moments
-from sb3_fedguide.server.clients import OF_A_RUN, WITH_SERVER, difference
-from sb3_fedguide.server.figures import ClientEvaluation
+from sb3_fedguide.registry import algorithm_name
 from sb3_fedguide.server.payload import Payload
-from sb3_fedguide.server.transport import KINDS, RUN, UNPREPARED, Message
 from sb3_fedguide.server.trunk import MOMENTS, TRUNK
+from sb3_fedguide.state.checkpoint_files import newest_checkpoint, remove_leftovers, write_checkpoint
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ class Site:
     def handle(self, message: Message) -> Message:
         """Do what the server asks, and answer; the answer has the same kind and round.
 
-        Whatever it raises stays here: a transport sends :meth:`~sb3_fedguide.server.transport.Failure.of` instead.
+        Whatever it raises stays here: a transport sends :meth:`~sb3_fedguide.deployment.transport.Failure.of` instead.
 
         :raises ValueError: for a message of another run, or of a server that has gone back in this one
         :raises RuntimeError: after an exception
@@ -324,11 +324,11 @@ class _LastLog(KVWriter):
 def make_site(config: Mapping[str, Any], folder: str | Path) -> Site:
     """The site that a client's own configuration describes.
 
-    :param config: see :class:`sb3_fedguide.cli.site_config.SiteConfig`
+    :param config: see :class:`sb3_fedguide.deployment.site_config.SiteConfig`
     :param folder: for the client's state
     :raises ValueError: for anything unknown, missing, of the wrong type or out of range
     """
-    from sb3_fedguide.cli.site_config import make_client, read_site_config
+    from sb3_fedguide.deployment.site_config import make_client, read_site_config
 
     checked = read_site_config(config)
     model, n_rounds = make_client(checked)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from fed_envs.plain_data import TAG, State
-from sb3_fedguide.common.array_files import read_arrays, write_arrays
+from sb3_fedguide.state.array_files import read_arrays, write_arrays
 
 #: How many checkpoints stay: the newest may turn out to be damaged.
 KEPT = 2

@@ -11,7 +11,7 @@ import sb3_fedguide
 from fed_envs.plain_data import State, freeze, thaw
 
 if TYPE_CHECKING:
-    from sb3_fedguide.server.serve import ServerConfig
+    from sb3_fedguide.deployment.serve import ServerConfig
 
 Facts = dict[str, Any]
 

@@ -14,8 +14,8 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 
-from sb3_fedguide.algorithms import ALGORITHMS, algorithm
-from sb3_fedguide.cli.names import check_names
+from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.settings.names import check_names
 from sb3_fedguide.settings.ranges import check_range
 
 #: Constructor parameters that have a flag of their own or no meaning on the command line.

@@ -21,10 +21,16 @@ from flwr.supercore.runtime import RuntimeHttpClient
 
 from sb3_fedguide import __version__
 from sb3_fedguide.cli.run import EXIT_FAILED
-from sb3_fedguide.flower.certificates import CA, LOOPBACK, SERVER, SERVER_KEY
-from sb3_fedguide.flower.processes import FlowerProcess, environment, free_port, loopback_without_proxy, runtime_version
-from sb3_fedguide.flower.proxy import FleetProxy, ProxyServer
-from sb3_fedguide.flower.server_app import CONFIG
+from sb3_fedguide.deployment.flower.certificates import CA, LOOPBACK, SERVER, SERVER_KEY
+from sb3_fedguide.deployment.flower.processes import (
+    FlowerProcess,
+    environment,
+    free_port,
+    loopback_without_proxy,
+    runtime_version,
+)
+from sb3_fedguide.deployment.flower.proxy import FleetProxy, ProxyServer
+from sb3_fedguide.deployment.flower.server_app import CONFIG
 
 _POLL_SECONDS = 0.2
 _START_SECONDS = 120.0
@@ -39,8 +45,8 @@ license = "MIT"
 [tool.flwr.app]
 publisher = "fedguide"
 [tool.flwr.app.components]
-serverapp = "sb3_fedguide.flower.server_app:app"
-clientapp = "sb3_fedguide.flower.client_app:app"
+serverapp = "sb3_fedguide.deployment.flower.server_app:app"
+clientapp = "sb3_fedguide.deployment.flower.client_app:app"
 """
 
 

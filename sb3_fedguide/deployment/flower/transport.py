@@ -10,8 +10,8 @@ from flwr.app import MessageType
 from flwr.common.constant import ErrorCode
 from flwr.serverapp import Grid
 
-from sb3_fedguide.flower.records import from_records, to_records
-from sb3_fedguide.server.transport import Failure, Message
+from sb3_fedguide.deployment.flower.records import from_records, to_records
+from sb3_fedguide.deployment.transport import Failure, Message
 
 _POLL_SECONDS = 0.2
 #: Flower takes a message without a limit for one of twelve hours.

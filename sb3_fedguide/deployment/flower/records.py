@@ -8,7 +8,7 @@ import re
 import numpy as np
 from flwr.app import Array, ArrayRecord, ConfigRecord, RecordDict
 
-from sb3_fedguide.server.transport import Failure, Message
+from sb3_fedguide.deployment.transport import Failure, Message
 
 _PAYLOAD, _REST = "payload", "message"
 _REASON = re.compile(r"error: \w{1,80}")

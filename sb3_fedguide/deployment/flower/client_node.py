@@ -14,10 +14,16 @@ from flwr.proto.runtime_pb2 import AcquireTaskRequest
 from flwr.supercore.constant import TaskType
 from flwr.supercore.runtime import RuntimeHttpClient
 
-from sb3_fedguide.common.site import PARAMETERS, SITE
-from sb3_fedguide.flower.certificates import LOOPBACK
-from sb3_fedguide.flower.client_app import FINISHED, app
-from sb3_fedguide.flower.processes import FlowerProcess, environment, free_port, loopback_without_proxy, runtime_version
+from sb3_fedguide.deployment.flower.certificates import LOOPBACK
+from sb3_fedguide.deployment.flower.client_app import FINISHED, app
+from sb3_fedguide.deployment.flower.processes import (
+    FlowerProcess,
+    environment,
+    free_port,
+    loopback_without_proxy,
+    runtime_version,
+)
+from sb3_fedguide.deployment.site import PARAMETERS, SITE
 
 _POLL_SECONDS = 0.2
 #: The SuperLink refuses a key for up to a minute after its SuperNode was killed.
@@ -33,12 +39,12 @@ class ClientNode:
 
     In Flower the server sends the code that its clients run. Here it cannot: of Flower's kinds of tasks this takes
     messages for a client and no others, and answers them in a fork of this process with the installed
-    :mod:`sb3_fedguide.flower.client_app`. What the server sent as an app is neither unpacked nor installed.
+    :mod:`sb3_fedguide.deployment.flower.client_app`. What the server sent as an app is neither unpacked nor installed.
 
     :param server: ``host:port``
     :param ca: file of the authority that signed the server's certificate
     :param key: file of this client's private key
-    :param config: JSON file that the app reads: ``site`` for :func:`~sb3_fedguide.common.site.make_site`, and ``folder``
+    :param config: JSON file that the app reads: ``site`` for :func:`~sb3_fedguide.deployment.site.make_site`, and ``folder``
     :param folder: that folder; Flower keeps its own files in it too
     """
 

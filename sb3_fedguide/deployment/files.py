@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 
 import pydantic
 
-from sb3_fedguide.algorithms import ALGORITHMS
-from sb3_fedguide.cli.config import CONFIGURATIONS, DEFAULT, config_path, read_config, read_yaml
-from sb3_fedguide.cli.names import check_names
-from sb3_fedguide.flower.certificates import CA, SERVER, SERVER_KEY, read_public_key
+from sb3_fedguide.deployment.config import ServerConfig
+from sb3_fedguide.deployment.flower.certificates import CA, SERVER, SERVER_KEY, read_public_key
+from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.server.build import COMMON, find_method, make_strategy
-from sb3_fedguide.server.config import ServerConfig
+from sb3_fedguide.settings.config import CONFIGURATIONS, DEFAULT, config_path, read_config, read_yaml
+from sb3_fedguide.settings.names import check_names
 
 #: Default of every algorithm's constructor, which a server without PyTorch cannot ask.
 ROLLOUT_SIZE = 4096

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch as th
 
 from fed_envs.plain_data import State
-from sb3_fedguide.common.stacked import to_arrays, to_tensors
+from sb3_fedguide.state.stacked import to_arrays, to_tensors
 
 
 def optimizer_state(optimizer: th.optim.Optimizer) -> State:

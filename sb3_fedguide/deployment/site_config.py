@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 import fed_envs
-from sb3_fedguide.algorithms import ALGORITHMS
-from sb3_fedguide.cli.config import resolve
-from sb3_fedguide.cli.names import check_names
-from sb3_fedguide.cli.schema import check_model
+from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.settings.config import resolve
+from sb3_fedguide.settings.names import check_names
+from sb3_fedguide.settings.schema import check_model
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation

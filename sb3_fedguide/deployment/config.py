@@ -34,8 +34,8 @@ class ServerConfig:
     :param start_clients: clients that are awaited before anything begins; by default all
     :param min_clients: replies without which a round does not end: those missing are asked again
     :param wait: seconds to wait for too few clients before
-        :class:`~sb3_fedguide.server.serve.TooFewClients` ends the run; 0 not to wait, ``None`` for ever. At the end, who is
-        away is waited for no longer than this and ``timeout``, or ten minutes
+        :class:`~sb3_fedguide.deployment.serve.TooFewClients` ends the run; 0 not to wait, ``None`` for ever. At the end,
+        who is away is waited for no longer than this and ``timeout``, or ten minutes
     :param poll: seconds between two looks at who is there
     :raises ValueError: for values that do not fit
     """
