@@ -1,43 +1,69 @@
-"""The algorithms by name. Looking one up imports it; listing them imports nothing."""
+"""The one table of algorithms: class, server and settings of each. Looking one up imports it; listing imports nothing."""
 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
-#: command-line name to module and class
-ALGORITHMS: dict[str, tuple[str, str]] = {
-    "local": ("sb3_fedguide.algorithms.local", "Local"),
-    "pooled": ("sb3_fedguide.algorithms.pooled", "Pooled"),
-    "fedavg": ("sb3_fedguide.algorithms.fedavg", "FedAvg"),
-    "fedprox": ("sb3_fedguide.algorithms.fedprox", "FedProx"),
-    "fedkl": ("sb3_fedguide.algorithms.fedkl", "FedKL"),
-    "fedsvrpgm": ("sb3_fedguide.algorithms.fedsvrpgm", "FedSVRPGM"),
-    "fedrl": ("sb3_fedguide.algorithms.fedrl", "FedRL"),
-    "fedguide": ("sb3_fedguide.algorithms.fedguide", "FedGuide"),
-    "fedguide-p": ("sb3_fedguide.algorithms.fedguide", "FedGuideP"),
-    "fedguide-a": ("sb3_fedguide.algorithms.fedguide", "FedGuideA"),
-    "fedguide-r": ("sb3_fedguide.algorithms.fedguide_r", "FedGuideR"),
+
+class Entry(NamedTuple):
+    """An algorithm.
+
+    :param module: where its class is
+    :param cls: the class's name
+    :param server: ``"module:name"`` of its server's :class:`~sb3_fedguide.server.build.Method`; ``None`` for its base class's
+    :param settings: its YAML file; ``None`` for ``<name>.yml`` in ``zoo_configs``, or else that of the nearest base class
+    """
+
+    module: str
+    cls: str
+    server: str | None = None
+    settings: Path | None = None
+
+
+def _ours(module: str, cls: str, server: str) -> Entry:
+    return Entry(f"sb3_fedguide.algorithms.{module}", cls, f"sb3_fedguide.server.build:{server}")
+
+
+#: by command-line name
+ALGORITHMS: dict[str, Entry] = {
+    "local": _ours("local", "Local", "NOTHING"),
+    "pooled": _ours("pooled", "Pooled", "NOTHING"),
+    "fedavg": _ours("fedavg", "FedAvg", "PPO_AVERAGING"),
+    "fedprox": _ours("fedprox", "FedProx", "PPO_AVERAGING"),
+    "fedkl": _ours("fedkl", "FedKL", "PPO_AVERAGING"),
+    "fedsvrpgm": _ours("fedsvrpgm", "FedSVRPGM", "SVRPG_AVERAGING"),
+    "fedrl": _ours("fedrl", "FedRL", "DDPG_AVERAGING"),
+    "fedguide": _ours("fedguide", "FedGuide", "EXPERTS"),
+    "fedguide-p": _ours("fedguide", "FedGuideP", "EXPERTS"),
+    "fedguide-a": _ours("fedguide", "FedGuideA", "EXPERTS_AND_PARAMETERS"),
+    "fedguide-r": _ours("fedguide_r", "FedGuideR", "PPO_AVERAGING_BEYOND"),
 }
 
 
-def register_algorithm(name: str, entry_point: str) -> None:
+def register_algorithm(name: str, entry_point: str, server: str | None = None, settings: str | Path | None = None) -> None:
     """Make an algorithm of one's own known by name, on the command line too (``--gym-packages``).
 
     :param name: what ``--algo`` takes
     :param entry_point: ``"module:Class"``, imported when it is first used
+    :param server: ``"module:name"`` of its :class:`~sb3_fedguide.server.build.Method`, which a server imports and may do
+        without PyTorch; without it, the nearest base class's
+    :param settings: YAML file with its hyperparameters; without it, those of the nearest base class
     :raises ValueError: for a name that means something else already
     """
+    for what, value in (("entry_point", entry_point), ("server", server)):
+        if value is not None and not all(value.partition(":")):
+            raise ValueError(f"{what}={value!r} must be 'module:{'Class' if what == 'entry_point' else 'name'}'")
     module, _, cls = entry_point.partition(":")
-    if not module or not cls:
-        raise ValueError(f"entry_point={entry_point!r} must be 'module:Class'")
-    if ALGORITHMS.get(name, (module, cls)) != (module, cls):
-        raise ValueError(f"the name {name!r} is taken by {':'.join(ALGORITHMS[name])}; choose another")
-    ALGORITHMS[name] = (module, cls)
+    entry = Entry(module, cls, server, None if settings is None else Path(settings).absolute())
+    known = ALGORITHMS.setdefault(name, entry)
+    if entry not in (known, Entry(known.module, known.cls)):
+        raise ValueError(f"the name {name!r} is taken by {known.module}:{known.cls}; choose another")
 
 
 def algorithm(name: str) -> type[FederatedPPO] | type[FederatedDDPG]:
@@ -45,8 +71,8 @@ def algorithm(name: str) -> type[FederatedPPO] | type[FederatedDDPG]:
 
     :raises KeyError: for an unknown name
     """
-    module, cls = ALGORITHMS[name]
-    return getattr(import_module(module), cls)
+    entry = ALGORITHMS[name]
+    return getattr(import_module(entry.module), entry.cls)
 
 
 def algorithm_name(cls: type) -> str:
@@ -54,7 +80,17 @@ def algorithm_name(cls: type) -> str:
 
     :raises ValueError: for a class that no name is registered for
     """
-    for name, entry_point in ALGORITHMS.items():
-        if entry_point == (cls.__module__, cls.__name__):
+    for name, entry in ALGORITHMS.items():
+        if (entry.module, entry.cls) == (cls.__module__, cls.__name__):
             return name
     raise ValueError(f"{cls.__name__} has no name; give it one with register_algorithm()")
+
+
+def registered_names(cls: type) -> list[str]:
+    """The names of a class and of its bases, nearest first."""
+    return [
+        name
+        for base in cls.__mro__
+        for name, entry in ALGORITHMS.items()
+        if (entry.module, entry.cls) == (base.__module__, base.__name__)
+    ]

@@ -64,7 +64,7 @@ def test_the_example_does_what_it_says(monkeypatch):
     model.receive(1, average)
     for name, tensor in model.policy.client_state_dict(1).items():
         np.testing.assert_allclose(tensor.numpy(), 0.5 * before[name].numpy() + 1.0, rtol=1e-6)
-    monkeypatch.delitem(ALGORITHMS, "half-averaging")
+    del ALGORITHMS["half-averaging"]
 
 
 def test_a_taken_name_is_refused():

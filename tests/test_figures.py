@@ -20,7 +20,7 @@ from sb3_fedguide.benchmark.figures.layout import fit_scale, panels
 from sb3_fedguide.benchmark.figures.runs import from_result
 from sb3_fedguide.benchmark.figures.styles import STYLES, style
 from sb3_fedguide.benchmark.results import read_result
-from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.registry import ALGORITHMS, Entry
 from tests.result_files import CLIENTS, result, write_result
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
@@ -120,7 +120,7 @@ def test_clients_below_60_percent_of_their_best_are_stuck(tmp_path):
 
 
 def test_every_registered_algorithm_has_a_look_of_its_own():
-    assert set(STYLES) == {name for name, (module, _) in ALGORITHMS.items() if module.startswith("sb3_fedguide.")}
+    assert set(STYLES) == {name for name, entry in ALGORITHMS.items() if entry.module.startswith("sb3_fedguide.")}
     looks = [style(name) for name in STYLES]
     assert len({(look.color, look.line) for look in looks}) == len({look.marker for look in looks}) == len(looks)
     assert len({(look.color, look.hatch) for look in looks}) == len(looks)  # bars
@@ -131,7 +131,7 @@ def test_every_registered_algorithm_has_a_look_of_its_own():
 
 def test_algorithms_of_ones_own_look_like_no_other(monkeypatch):
     for number in range(10):
-        monkeypatch.setitem(ALGORITHMS, f"mine-{number}", ("mine", "Mine"))
+        monkeypatch.setitem(ALGORITHMS, f"mine-{number}", Entry("mine", "Mine"))
     looks = [style(name) for name in ALGORITHMS]
     assert len({(look.color, str(look.line), look.marker) for look in looks}) == len(looks)
     assert style("fedavg") == STYLES["fedavg"] and style("not registered") == style("not registered")

@@ -293,7 +293,8 @@ def test_flower_is_told_to_be_silent() -> None:
 
 def test_the_server_needs_neither_pytorch_nor_a_simulator() -> None:
     code = (
-        "import sys; from sb3_fedguide.deployment import files; from sb3_fedguide.deployment.flower import server_app, server_node; "
+        "import sys; from sb3_fedguide.deployment import files; "
+        "from sb3_fedguide.deployment.flower import server_app, server_node; "
         "print(*{'torch', 'mujoco', 'stable_baselines3'} & sys.modules.keys())"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -19,6 +19,7 @@ from sb3_fedguide.cli.main import main as fedguide
 from sb3_fedguide.cli.train import Run, main
 from sb3_fedguide.settings import schema
 from sb3_fedguide.settings.config import NESTED, resolve
+from sb3_fedguide.settings.networks import StochasticNetworkConfig
 from sb3_fedguide.settings.pretraining import PretrainingConfig
 
 
@@ -27,7 +28,7 @@ def fuzz(max_examples: int) -> settings:
     return settings(max_examples=max_examples, derandomize=True, deadline=None, database=None, suppress_health_check=quiet)
 
 
-PARTS = {"pretraining": PretrainingConfig, "policy_kwargs": schema.NetworkConfig}
+PARTS = {"pretraining": PretrainingConfig, "policy_kwargs": StochasticNetworkConfig}
 NAMES = sorted(
     {"policy", "n_rounds", *schema.all_names(), *(f"{part}.{field}" for part in PARTS for field in PARTS[part].model_fields)}
 )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -52,3 +54,47 @@ def test_every_public_name_can_be_loaded() -> None:
     assert set(sb3_fedguide._LAZY) | {"__version__"} == set(sb3_fedguide.__all__)
     with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
         _ = sb3_fedguide.Nothing
+
+
+#: From the lowest: what stands before may be imported, nothing that stands behind.
+LAYERS = (
+    "fed_envs", "settings", "state", "server", "priors", "offline", "common", "algorithms", "engines", "benchmark",
+    "monitoring", "deployment", "cli",
+)  # fmt: skip
+#: Modules of the package itself that import nothing above them.
+LOWEST = ("registry", "seeding", "exit_codes")
+
+
+def imported_at_run_time(tree: ast.AST) -> Iterator[str]:
+    """Names that a module imports anywhere, without those for type hints alone."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        yield from imported_at_run_time(node)
+
+
+def room(name: str) -> str:
+    package, *rest = name.split(".")
+    return "fed_envs" if package == "fed_envs" or not rest or rest[0] in (*LOWEST, "__version__") else rest[0]
+
+
+@pytest.mark.parametrize("package", LAYERS)
+def test_imports_run_down(package: str) -> None:
+    paths = [ROOT / "sb3_fedguide" / f"{name}.py" for name in LOWEST] if package == "fed_envs" else []
+    paths += (ROOT / package if package == "fed_envs" else ROOT / "sb3_fedguide" / package).rglob("*.py")
+    wrong = [
+        f"{path.relative_to(ROOT)} imports {name}"
+        for path in paths
+        for name in imported_at_run_time(ast.parse(path.read_text(encoding="utf-8")))
+        if name.startswith(("sb3_fedguide", "fed_envs")) and LAYERS.index(room(name)) > LAYERS.index(package)
+    ]
+    assert not wrong
+
+
+def test_every_package_has_its_layer() -> None:
+    packages = {path.parent.name for path in (ROOT / "sb3_fedguide").glob("*/__init__.py")}
+    assert packages == set(LAYERS) - {"fed_envs"}

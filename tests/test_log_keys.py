@@ -119,7 +119,7 @@ def general(key: str) -> str:
 
 
 def test_every_algorithm_is_run():
-    assert set(SETTINGS) == {name for name, (module, _) in ALGORITHMS.items() if module.startswith("sb3_fedguide.")}
+    assert set(SETTINGS) == {name for name, entry in ALGORITHMS.items() if entry.module.startswith("sb3_fedguide.")}
 
 
 def test_every_logged_key_is_documented(runs):

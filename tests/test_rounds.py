@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from sb3_fedguide import FedAvg, FedGuideA
-from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide import FedAvg, FedGuideA, registry
+from sb3_fedguide.registry import ALGORITHMS, algorithm, register_algorithm
 from sb3_fedguide.server import build
 from sb3_fedguide.server.averaging import Averaging
-from sb3_fedguide.server.build import METHODS, Method, complete_settings, make_strategy, register_method
+from sb3_fedguide.server.build import Method, complete_settings, find_method, make_strategy, method_of
 from sb3_fedguide.server.ot_moe import OTMoE
 from sb3_fedguide.server.participants import draw_participants
 from sb3_fedguide.server.rounds import Rounds, participants
@@ -71,7 +71,7 @@ def test_defaults_on_the_server_are_those_of_the_constructors(name):
     parameters = hyperparameters(algorithm(name))
     settings = complete_settings(name, {})
     assert settings == {key: parameters[key][1] for key in settings}
-    assert algorithm(name).server_method in METHODS
+    assert method_of(algorithm(name)) is find_method(name)
 
 
 def test_one_definition_for_models_and_servers():
@@ -117,14 +117,27 @@ class Own(FedAvg):
         return Averaging(self.averaged_prefixes)
 
 
+def double(settings, n_clients, seed):
+    return Averaging(("x",) * settings["k"] * n_clients)
+
+
+OWN_METHOD = Method(double, {"k": 1})
+
+
 def test_algorithms_of_ones_own(monkeypatch):
-    monkeypatch.setitem(ALGORITHMS, "half", (__name__, "Half"))
-    monkeypatch.setitem(ALGORITHMS, "own", (__name__, "Own"))
-    assert make_strategy("half", {"average_every": 3}, 3, 0).average_every == 3  # its class's own server
-    with pytest.raises(ValueError, match="register_method"):
+    monkeypatch.setattr(registry, "ALGORITHMS", known := dict(ALGORITHMS))
+    monkeypatch.setattr(build, "ALGORITHMS", known)
+    register_algorithm("half", f"{__name__}:Half")
+    register_algorithm("own", f"{__name__}:Own")
+    assert make_strategy("half", {"average_every": 3}, 3, 0).average_every == 3  # its base class's server
+    with pytest.raises(ValueError, match=r"Own makes its strategy itself.*register_algorithm\(\.\.\., server="):
         make_strategy("own", {}, 3, 0)
-    monkeypatch.setattr(build, "METHODS", dict(METHODS))
-    register_method("own", Method(lambda settings, n_clients, seed: Averaging(("x",) * n_clients), {"k": 1}))
-    assert make_strategy("own", {"k": 2}, 3, 0).prefixes == ("x",) * 3
-    with pytest.raises(ValueError, match="has a server's side already"):
-        register_method("own", METHODS["fedavg"])
+    register_algorithm("own, deployed", f"{__name__}:Own", server=f"{__name__}:OWN_METHOD")
+    assert make_strategy("own, deployed", {"k": 2}, 3, 0).prefixes == ("x",) * 6
+    with pytest.raises(ValueError, match="is taken by"):
+        register_algorithm("own", f"{__name__}:Half")
+    with pytest.raises(ValueError, match="server='here' must be 'module:name'"):
+        register_algorithm("other", f"{__name__}:Half", server="here")
+    register_algorithm("wrong", f"{__name__}:Half", server=f"{__name__}:double")
+    with pytest.raises(ValueError, match="must name a sb3_fedguide"):
+        make_strategy("wrong", {}, 3, 0)

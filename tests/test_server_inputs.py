@@ -120,8 +120,9 @@ class Finder(importlib.machinery.PathFinder):  # as if they were not installed
         return None if name.partition(".")[0] in blocked else super().find_spec(name, path, target)
 
 sys.meta_path[:] = [Finder if finder is importlib.machinery.PathFinder else finder for finder in sys.meta_path]
-from sb3_fedguide.server.build import METHODS, complete_settings, make_strategy
-for name in METHODS:
+from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.server.build import complete_settings, make_strategy
+for name in ALGORITHMS:
     make_strategy(name, {}, 3, 0)
 import numpy as np
 import sb3_fedguide

@@ -13,5 +13,3 @@ class FedAvg(ParameterAveraging, FederatedPPO):
 
     Parameters are those of :class:`~sb3_fedguide.common.parameter_averaging.ParameterAveraging` and of :class:`FederatedPPO`.
     """
-
-    server_method = "fedavg"

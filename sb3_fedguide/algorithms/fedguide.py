@@ -68,7 +68,6 @@ class FedGuide(FederatedPPO):
     """
 
     uses_prior = True
-    server_method = "fedguide"
     uses_dice: ClassVar[bool] = True
     state_attributes: ClassVar[tuple[str, ...]] = (
         "heads", "score_moments", "experts", "mixture_rows", "dice_scale", "calibrated",
@@ -364,8 +363,6 @@ class FedGuideA(ParameterAveraging, FedGuide):
     Parameters are those of :class:`~sb3_fedguide.common.parameter_averaging.ParameterAveraging`, with other defaults, and of
     :class:`FedGuide`.
     """
-
-    server_method = "fedguide-a"
 
     def __init__(
         self,

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_fedguide.common.parameters import take_prefix
 from sb3_fedguide.offline.dice import DiceValue
 from sb3_fedguide.offline.pretraining import untrained_prior
 from sb3_fedguide.priors.adaptation import HeadAdaptation
 from sb3_fedguide.priors.base import HeadStatistics
+from sb3_fedguide.state.array_files import take_prefix
 from sb3_fedguide.state.stacked import to_arrays, to_tensors
 
 if TYPE_CHECKING:

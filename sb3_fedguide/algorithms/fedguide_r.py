@@ -23,8 +23,6 @@ class FedGuideR(FedAvg):
     Parameters are those of :class:`FedAvg`, with other defaults.
     """
 
-    server_method = "fedguide-r"
-
     def __init__(
         self,
         policy: PolicyLike,

@@ -18,8 +18,6 @@ class FedRL(ParameterAveraging, FederatedDDPG):
     :class:`FederatedDDPG`.
     """
 
-    server_method = "fedrl"
-
     def receive(self, index: int, broadcast: Payload) -> None:
         super().receive(index, broadcast)
         if broadcast:

@@ -37,7 +37,6 @@ class FedSVRPGM(FedAvg):
     All other parameters are those of :class:`FedAvg`.
     """
 
-    server_method = "fedsvrpgm"
     state_attributes = ("reference", "reference_period", "momentum", "directions")
 
     def __init__(

@@ -28,7 +28,6 @@ class Pooled(FederatedPPO):
     :raises ValueError: for ``client_fraction`` below 1
     """
 
-    server_method = "pooled"
     is_federated: ClassVar[bool] = False
 
     def __init__(self, policy: PolicyLike, env: FederationLike | None, **ppo: Unpack[FederatedPPOArguments]) -> None:

@@ -56,7 +56,7 @@ def _action_space(arguments: argparse.Namespace) -> Space:
     import numpy as np
 
     import fed_envs
-    from sb3_fedguide.cli.train import import_packages
+    from sb3_fedguide.settings.packages import import_packages
 
     low, high = arguments.action_low, arguments.action_high
     if (arguments.env is None) == (low is None) or (low is None) != (high is None):

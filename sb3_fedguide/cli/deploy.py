@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 from sb3_fedguide.cli.arguments import OneLineParser
 from sb3_fedguide.cli.output import pipe_may_close
-from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.cli.run_folder import exclusive, write_json
 from sb3_fedguide.cli.signals import StopSignals
+from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 
 if TYPE_CHECKING:
     from sb3_fedguide.deployment.files import ClientDeployment

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from sb3_fedguide.cli.arguments import OneLineParser
 from sb3_fedguide.cli.output import pipe_may_close
 from sb3_fedguide.cli.saved_run import load_model, read_run
-from sb3_fedguide.cli.train import import_packages
+from sb3_fedguide.settings.packages import import_packages
 
 if TYPE_CHECKING:
     import numpy as np

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 from sb3_fedguide.cli.arguments import OneLineParser
 from sb3_fedguide.cli.benchmark_arguments import benchmark_parser, check_methods, parse_benchmark
 from sb3_fedguide.cli.output import pipe_may_close
-from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, one_message
-from sb3_fedguide.cli.train import import_packages
+from sb3_fedguide.cli.run import one_message
+from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.settings.names import check_names
+from sb3_fedguide.settings.packages import import_packages
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

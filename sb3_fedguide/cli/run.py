@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.cli.signals import StopSignals
+from sb3_fedguide.exit_codes import EXIT_USAGE
 
 if TYPE_CHECKING:
     from stable_baselines3.common.logger import TensorBoardOutputFormat
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ppo import FederatedPPO
     from sb3_fedguide.settings.config import Config
 
-EXIT_FAILED, EXIT_USAGE = 1, 2
 LONGEST_MESSAGE = 2000
 
 

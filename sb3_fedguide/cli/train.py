@@ -28,9 +28,11 @@ from sb3_fedguide.cli.resume import (
     read_settings,
     with_length,
 )
-from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, Run, one_message
+from sb3_fedguide.cli.run import Run, one_message
+from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.settings.names import check_names
+from sb3_fedguide.settings.packages import import_packages
 
 if TYPE_CHECKING:
     from fed_envs import Family
@@ -141,20 +143,6 @@ def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Call
             check_length(folder, config, run.model.round)
         run.lock = stack.pop_all()
     return run
-
-
-def import_packages(modules: Sequence[str]) -> None:
-    """Import the user's modules, from the current folder too.
-
-    :raises ValueError: for one that cannot be imported
-    """
-    if modules and "" not in sys.path:
-        sys.path.insert(0, "")
-    for module in modules:
-        try:
-            importlib.import_module(module)
-        except Exception as error:  # whatever the user's module raises while it is imported
-            raise ValueError(f"--gym-packages {module}: {type(error).__name__}: {error}") from None
 
 
 def find_family(arguments: argparse.Namespace) -> Family:

@@ -17,18 +17,19 @@ from typing import TYPE_CHECKING, Any
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.benchmark_arguments import train_flags
 from sb3_fedguide.cli.output import pipe_may_close
-from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE, one_message
+from sb3_fedguide.cli.run import one_message
 from sb3_fedguide.cli.train import (
     EXIT_INTERRUPTED,
     check_before_imports,
     find_family,
-    import_packages,
     overrides,
     prepare,
 )
 from sb3_fedguide.cli.tune_arguments import N_TRIALS, PASSED_ON, SETTINGS, parse_tune
+from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.settings.names import check_names
+from sb3_fedguide.settings.packages import import_packages
 
 if TYPE_CHECKING:
     import optuna

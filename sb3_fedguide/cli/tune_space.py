@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.registry import algorithm, registered_names
 
 if TYPE_CHECKING:
     import optuna
@@ -99,9 +99,7 @@ def default_space(algo: str, fixed: Mapping[str, Any]) -> Space:
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
     cls = algorithm(algo)
-    names = {entry_point: name for name, entry_point in ALGORITHMS.items() if name in OWN}
-    known = (names.get((base.__module__, base.__name__)) for base in cls.__mro__)
-    own = OWN.get(next((name for name in known if name is not None), ""), {})
+    own = OWN.get(next((name for name in registered_names(cls) if name in OWN), ""), {})
     entries = {**own, **(PPO if issubclass(cls, FederatedPPO) else DDPG)}
     left = {name: values for name, values in entries.items() if name not in fixed}
     if not left:

@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_fedguide.common.normalization import FederatedNormalizer
-from sb3_fedguide.server.build import COMMON, complete_settings, find_method, make_strategy
+from sb3_fedguide.server.build import COMMON, Method, complete_settings, make_strategy, method_of
 from sb3_fedguide.server.payload import OBSERVATIONS
 from sb3_fedguide.server.strategy import Payload, Strategy
 
@@ -19,8 +19,6 @@ class Exchange(BaseAlgorithm):
     :meth:`outgoing` and :meth:`take_broadcasts`, which add what every method has.
     """
 
-    #: name of the server's side in :data:`sb3_fedguide.server.build.METHODS`
-    server_method: ClassVar[str] = "local"
     #: whether every client's data may stay where it is; what is not federated cannot be divided among processes or machines
     is_federated: ClassVar[bool] = True
     strategy: Strategy | None
@@ -42,12 +40,25 @@ class Exchange(BaseAlgorithm):
     def _make_strategy(self) -> Strategy | None:
         """The server's side of this method; ``None`` where nothing is exchanged."""
         assert self.seed is not None
-        return make_strategy(self.server_method, self.server_settings(), len(self.client_ids), self.seed)
+        return make_strategy(method_of(type(self)), self.server_settings(), len(self.client_ids), self.seed)
+
+    @classmethod
+    def registered_method(cls) -> Method:
+        """The server's side by which a server without this model makes its strategy.
+
+        :raises ValueError: for a class that makes its strategy itself
+        """
+        if cls._make_strategy is not Exchange._make_strategy:
+            raise ValueError(
+                f"{cls.__name__} makes its strategy itself, which needs the model; state its server's side in "
+                "register_algorithm(..., server='module:name'), see docs/extending.md"
+            )
+        return method_of(cls)
 
     def server_settings(self) -> dict[str, Any]:
         """What the server of this method has to know, by the names of the constructor's parameters."""
-        own = {name: getattr(self, name) for name in (*COMMON, *find_method(self.server_method).defaults)}
-        return complete_settings(self.server_method, own)
+        method = method_of(type(self))
+        return complete_settings(method, {name: getattr(self, name) for name in (*COMMON, *method.defaults)})
 
     def upload(self, index: int) -> Payload:
         """What the client at position ``index`` sends of its method: float32 arrays and nothing else."""

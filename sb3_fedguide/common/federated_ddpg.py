@@ -33,6 +33,7 @@ from sb3_fedguide.common.training_log import RoundStatistics
 from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
 from sb3_fedguide.seeding import Role, integer_seed
 from sb3_fedguide.server.validation import UPLOAD_BOUND
+from sb3_fedguide.settings.networks import DeterministicNetworkConfig, NetworkConfig
 from sb3_fedguide.settings.ranges import check_ranges
 
 
@@ -79,6 +80,9 @@ class FederatedDDPG(Federation, DDPG):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": StackedDDPGPolicy}
+    network_config: ClassVar[type[NetworkConfig]] = DeterministicNetworkConfig
+    #: whose settings an algorithm of one\'s own starts from that has none
+    base_settings: ClassVar[str | None] = None
     replay_buffer: FederatedReplayBuffer | None  # type: ignore[assignment]
     policy: StackedDDPGPolicy
     train_freq: int

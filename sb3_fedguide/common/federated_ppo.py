@@ -30,6 +30,7 @@ from sb3_fedguide.common.training_log import RoundStatistics, record_training
 from sb3_fedguide.offline.pretraining import PretrainingConfig
 from sb3_fedguide.seeding import Role, integer_seed
 from sb3_fedguide.server.validation import UPLOAD_BOUND
+from sb3_fedguide.settings.networks import NetworkConfig, StochasticNetworkConfig
 from sb3_fedguide.settings.ranges import check_ranges
 from sb3_fedguide.state.stacked import clip_grad_norm_per_client
 
@@ -73,6 +74,9 @@ class FederatedPPO(Federation, PPO):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": StackedMlpPolicy}
+    network_config: ClassVar[type[NetworkConfig]] = StochasticNetworkConfig
+    #: whose settings an algorithm of one\'s own starts from that has none
+    base_settings: ClassVar[str | None] = "local"
     rollout_buffer: FederatedRolloutBuffer  # type: ignore[assignment]
     policy: StackedMlpPolicy
 

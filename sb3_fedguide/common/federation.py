@@ -31,9 +31,10 @@ from sb3_fedguide.common.resumable import Resumable
 from sb3_fedguide.common.warm_start import WarmStart
 from sb3_fedguide.offline.pretraining import PretrainingConfig
 from sb3_fedguide.seeding import Role, stream
-from sb3_fedguide.server.participants import draw_participants, n_participants
+from sb3_fedguide.server.participants import draw_participants
 from sb3_fedguide.server.strategy import Strategy
 from sb3_fedguide.server.validation import UPLOAD_BOUND
+from sb3_fedguide.settings.participants import n_participants
 
 if TYPE_CHECKING:
     from sb3_fedguide.engines.engine import Engine
@@ -45,7 +46,7 @@ SelfFederation = TypeVar("SelfFederation", bound="Federation")
 class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exchange, WarmStart, ParameterFiles, Resumable):
     """Mixin for SB3 algorithms that train all clients of a family in lockstep.
 
-    A method names the server's side in :attr:`server_method` (or makes it, with :meth:`_make_strategy`), and defines the
+    The registry names a method's server (or its class makes the strategy, in :meth:`_make_strategy`); the class defines the
     client's with :meth:`upload` and :meth:`receive`, and its part of the offline stage with :meth:`_pretrain`.
     """
 

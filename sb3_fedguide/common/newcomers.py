@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_fedguide.common.parameters import HEADER, take_prefix
+from sb3_fedguide.common.parameters import HEADER
 from sb3_fedguide.server.moments import Moments, merge
-from sb3_fedguide.state.array_files import read_arrays
+from sb3_fedguide.state.array_files import read_arrays, take_prefix
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation

@@ -19,7 +19,7 @@ from fed_envs.files import atomic_file
 from sb3_fedguide.common.export import SETTINGS, ClientPolicies, ClientPolicy, Normalization, client_settings
 from sb3_fedguide.common.normalization import Normalize
 from sb3_fedguide.common.spaces import describe_space, space_from
-from sb3_fedguide.state.array_files import array_mismatches, read_arrays, write_arrays
+from sb3_fedguide.state.array_files import array_mismatches, read_arrays, take_prefix, write_arrays
 from sb3_fedguide.state.stacked import client_state, to_arrays, to_tensors
 
 FORMAT, VERSION = "sb3_fedguide parameters", 1
@@ -179,11 +179,6 @@ def read_policies(path: str | Path, replaced: dict[str, np.ndarray] | None = Non
     except (KeyError, IndexError, StopIteration, TypeError, AttributeError, ValueError, RuntimeError, AssertionError) as error:
         raise ValueError(f"{path} is damaged: its header does not belong to its arrays ({error})") from None
     return found
-
-
-def take_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """The arrays whose names begin with ``prefix``, without it."""
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def _identity(model: ParameterFiles) -> dict[str, Any]:

@@ -9,7 +9,8 @@ import numpy as np
 import torch as th
 
 from sb3_fedguide.server.delays import Delays, DelaySettings
-from sb3_fedguide.server.participants import draw_participants, n_participants
+from sb3_fedguide.server.participants import draw_participants
+from sb3_fedguide.settings.participants import n_participants
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation

@@ -61,7 +61,7 @@ def read_site_config(config: Mapping[str, Any]) -> SiteConfig:
 
     :raises ValueError: for anything unknown, missing, of the wrong type or out of range
     """
-    from sb3_fedguide.cli.train import import_packages
+    from sb3_fedguide.settings.packages import import_packages
 
     checked = check_model("the client's configuration", SiteConfig, config, {})
     assert isinstance(checked, SiteConfig)

@@ -20,7 +20,6 @@ from gymnasium import spaces
 from torch import nn
 
 from fed_envs import Family, load_family
-from sb3_fedguide.common.parameters import take_prefix
 from sb3_fedguide.offline.behavior_cloning import clone
 from sb3_fedguide.offline.cache import arrays_hash, cache_folder, cached_arrays, content_key, keep_arrays
 from sb3_fedguide.offline.collect import check_source
@@ -32,6 +31,7 @@ from sb3_fedguide.priors import DiffusionPrior, GaussianPrior, HeadStatistics, P
 from sb3_fedguide.seeding import Role, stream
 from sb3_fedguide.server.trunk import MOMENTS, TRUNK
 from sb3_fedguide.settings.pretraining import Piece, PretrainingConfig
+from sb3_fedguide.state.array_files import take_prefix
 from sb3_fedguide.state.stacked import to_tensors
 
 __all__ = ["PretrainedPrior", "Pretraining", "PretrainingConfig", "untrained_prior"]

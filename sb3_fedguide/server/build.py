@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
-from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.registry import ALGORITHMS, algorithm, registered_names
 from sb3_fedguide.seeding import Role, seed_sequence
 from sb3_fedguide.server.averaging import Averaging, averaged_prefixes, check_averaging
 from sb3_fedguide.server.moments import ObservationMoments
@@ -63,73 +64,63 @@ _OF_AVERAGING = {
 }  # fmt: skip
 _AVERAGING = {"average": "all", **_OF_AVERAGING}
 _EXPERTS = {"n_experts": None, "eta": 0.05, "cost": "score", "cost_scaling": "max"}
-_PPO_AVERAGING = Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), _AVERAGING)
 
-#: Command-line name of an algorithm to its server's side.
-METHODS: dict[str, Method] = {
-    "local": Method(lambda settings, n_clients, seed: None, {}),
-    "pooled": Method(lambda settings, n_clients, seed: None, {}),
-    "fedavg": _PPO_AVERAGING,
-    "fedprox": _PPO_AVERAGING,
-    "fedkl": _PPO_AVERAGING,
-    "fedsvrpgm": Method(_averaging(SVRPG, PPO_ACTOR, PPO_CRITIC), _AVERAGING),
-    "fedrl": Method(_averaging(Averaging, DDPG_ACTOR, DDPG_CRITIC), _AVERAGING),
-    "fedguide": Method(_experts, _EXPERTS),
-    "fedguide-p": Method(_experts, _EXPERTS),
-    "fedguide-r": Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), {**_AVERAGING, "server_step": 2.0}),
-    "fedguide-a": Method(_experts_and_parameters, {**_EXPERTS, **_AVERAGING, "average": "actor", "average_every": 5}),
-}
-
-
-def register_method(name: str, method: Method) -> None:
-    """Make the server's side of an algorithm of one's own known; its class then says ``server_method = name``.
-
-    :raises ValueError: for a name that means something else already
-    """
-    if METHODS.get(name, method) != method:
-        raise ValueError(f"the method {name!r} has a server's side already; choose another name")
-    METHODS[name] = method
+#: The methods' servers; :data:`sb3_fedguide.registry.ALGORITHMS` says whose is which.
+NOTHING = Method(lambda settings, n_clients, seed: None, {})
+PPO_AVERAGING = Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), _AVERAGING)
+PPO_AVERAGING_BEYOND = Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), {**_AVERAGING, "server_step": 2.0})
+SVRPG_AVERAGING = Method(_averaging(SVRPG, PPO_ACTOR, PPO_CRITIC), _AVERAGING)
+DDPG_AVERAGING = Method(_averaging(Averaging, DDPG_ACTOR, DDPG_CRITIC), _AVERAGING)
+EXPERTS = Method(_experts, _EXPERTS)
+EXPERTS_AND_PARAMETERS = Method(_experts_and_parameters, {**_EXPERTS, **_AVERAGING, "average": "actor", "average_every": 5})
 
 
 def find_method(name: str) -> Method:
     """The server's side of an algorithm, by its command-line name.
 
-    Of an algorithm of one's own without one by its name, that which its class names; this imports the class and PyTorch.
+    Of an algorithm of one's own that is registered without one, its base class's; this imports the class and PyTorch.
 
     :raises ValueError: for an unknown algorithm, or one whose class makes its strategy itself
     """
-    if name in METHODS:
-        return METHODS[name]
     if name not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {name!r}; known are {', '.join(ALGORITHMS)}")
-    from sb3_fedguide.common.exchange import Exchange
-
-    cls = algorithm(name)
-    if cls._make_strategy is not Exchange._make_strategy:
-        raise ValueError(
-            f"{cls.__name__} makes its strategy itself, which needs the model; give its server's side to "
-            "sb3_fedguide.server.build.register_method() and its name to the class's server_method"
-        )
-    return METHODS[cls.server_method]
+    server = ALGORITHMS[name].server
+    return algorithm(name).registered_method() if server is None else _load(server)
 
 
-def complete_settings(algorithm: str, given: Settings) -> dict[str, Any]:
+def method_of(cls: type) -> Method:
+    """The server's side of the nearest base of a class that is registered with one; of others, nothing is exchanged."""
+    servers = (ALGORITHMS[name].server for name in registered_names(cls))
+    return next((_load(server) for server in servers if server is not None), NOTHING)
+
+
+def _load(server: str) -> Method:
+    module, _, name = server.partition(":")
+    method = getattr(import_module(module), name, None)
+    if not isinstance(method, Method):
+        raise ValueError(f"server={server!r} of an algorithm must name a sb3_fedguide.server.build.Method, not {method!r}")
+    return method
+
+
+def complete_settings(algorithm: str | Method, given: Settings) -> dict[str, Any]:
     """All settings of a method's server, those not given by their defaults.
 
     :raises ValueError: for a setting that the server does not have
     """
-    settings = {**COMMON, **find_method(algorithm).defaults}
+    method = find_method(algorithm) if isinstance(algorithm, str) else algorithm
+    settings = {**COMMON, **method.defaults}
     if unknown := sorted(given.keys() - settings.keys()):
-        raise ValueError(f"the server of {algorithm} has no setting {unknown[0]!r}; it has {', '.join(sorted(settings))}")
+        whose = f"of {algorithm} " if isinstance(algorithm, str) else ""
+        raise ValueError(f"the server {whose}has no setting {unknown[0]!r}; it has {', '.join(sorted(settings))}")
     complete = {**settings, **given}
     complete["normalize"] = "shared" if complete["normalize"] == "shared" else False  # what stays with clients is no matter
     return complete
 
 
-def make_strategy(algorithm: str, settings: Settings, n_clients: int, seed: int) -> Strategy | None:
+def make_strategy(algorithm: str | Method, settings: Settings, n_clients: int, seed: int) -> Strategy | None:
     """The strategy of an algorithm; ``None`` where nothing is exchanged.
 
-    :param algorithm: command-line name
+    :param algorithm: command-line name, or the method itself
     :param settings: hyperparameters that the server needs, under the names of the constructor's parameters
     :param n_clients: clients of the federation
     :param seed: the federation's
@@ -137,7 +128,8 @@ def make_strategy(algorithm: str, settings: Settings, n_clients: int, seed: int)
     """
     complete = complete_settings(algorithm, settings)
     check_ranges(complete)
-    strategy = find_method(algorithm).make(complete, n_clients, seed)
+    method = find_method(algorithm) if isinstance(algorithm, str) else algorithm
+    strategy = method.make(complete, n_clients, seed)
     if complete["normalize"] == "shared":
         moments = ObservationMoments(complete.get("aggregator", "mean"), complete.get("trim_fraction", 0.25))
         strategy = moments if strategy is None else Composite([strategy, moments])

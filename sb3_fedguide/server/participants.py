@@ -7,11 +7,6 @@ import numpy as np
 from sb3_fedguide.seeding import Role, stream
 
 
-def n_participants(client_fraction: float, n_clients: int) -> int:
-    """Clients in each round: the fraction of all, rounded, and at least one."""
-    return max(1, round(client_fraction * n_clients))
-
-
 def draw_participants(seed: int, round: int, n_clients: int, n_present: int) -> np.ndarray:
     """Who takes part in a round, ``(n_clients,)`` bool, drawn without replacement from the server's stream of that round."""
     present = np.zeros(n_clients, dtype=bool)

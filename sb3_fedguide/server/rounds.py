@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from sb3_fedguide.server.participants import draw_participants, n_participants
+from sb3_fedguide.server.participants import draw_participants
 from sb3_fedguide.server.payload import Payload
 from sb3_fedguide.server.strategy import Strategy
+from sb3_fedguide.settings.participants import n_participants
 
 
 class Rounds:

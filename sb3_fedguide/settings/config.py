@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.registry import ALGORITHMS, algorithm, registered_names
 from sb3_fedguide.settings import schema
 from sb3_fedguide.settings.names import check_names, nearest
+from sb3_fedguide.settings.participants import n_participants
 
 if TYPE_CHECKING:
     from fed_envs import Family
@@ -85,7 +86,7 @@ class Config:
         :raises ValueError: where the values do not fit together
         """
         values = {name: schema.schedule_or_value(value) for name, value in self.values.items() if name != "n_rounds"}
-        network = schema.network_config(algorithm(self.algo)).model_validate(values.pop("policy_kwargs"))
+        network = algorithm(self.algo).network_config.model_validate(values.pop("policy_kwargs"))
         policy = values.pop("policy")
         with warnings.catch_warnings():
             # SB3 compares a client's batch_size with the steps of all clients; FederatedPPO has checked it against its own.
@@ -141,8 +142,6 @@ def resolve(
 
 def rounds_of(values: Mapping[str, Any], n_clients: int, n_timesteps: int) -> int:
     """Rounds of ``n_timesteps`` steps of all clients together."""
-    from sb3_fedguide.server.participants import n_participants
-
     return -(-n_timesteps // (values["rollout_size"] * n_participants(values["client_fraction"], n_clients)))
 
 
@@ -164,7 +163,7 @@ def complete(given: Mapping[str, Any], algo: str) -> dict[str, Any]:
     for name, (hint, default) in parameters.items():
         if name not in NESTED:
             values[name] = schema.check_value(name, given[name], hint) if name in given else default
-    network = schema.check_model("policy_kwargs", schema.network_config(algorithm(algo)), given.get("policy_kwargs") or {}, {})
+    network = schema.check_model("policy_kwargs", algorithm(algo).network_config, given.get("policy_kwargs") or {}, {})
     offline = schema.check_model("pretraining", PretrainingConfig, given.get("pretraining") or {}, _SET_ELSEWHERE)
     values["policy_kwargs"] = network.model_dump(mode="json")
     values["pretraining"] = offline.model_dump(mode="json", exclude=set(_SET_ELSEWHERE))
@@ -176,12 +175,15 @@ def config_path(conf_file: str, algo: str) -> Path:
 
     :raises ValueError: if there is none
     """
+    own = ALGORITHMS[algo].settings
+    if conf_file == "tuned" and own is not None:
+        return own
     if conf_file in CONFIGURATIONS:
         import zoo_configs
 
-        folder = Path(next(iter(zoo_configs.__path__)))
-        path = folder / CONFIGURATIONS[conf_file] / f"{algo}.yml"
-        return path if path.is_file() else _inherited_path(path, algo)
+        folder = Path(next(iter(zoo_configs.__path__))) / CONFIGURATIONS[conf_file]
+        path = folder / f"{algo}.yml"
+        return path if path.is_file() else _inherited_path(folder, algo)
     path = Path(conf_file)
     if not path.is_file():
         hint = "" if path.suffix else nearest(conf_file, CONFIGURATIONS)
@@ -191,18 +193,13 @@ def config_path(conf_file: str, algo: str) -> Path:
     return path
 
 
-def _inherited_path(path: Path, algo: str) -> Path:
+def _inherited_path(folder: Path, algo: str) -> Path:
     """An algorithm of the user's own has no file here; it takes the settings of the nearest class that has one."""
-    from sb3_fedguide.common.federated_ppo import FederatedPPO
-
-    for base in algorithm(algo).__mro__:
-        for name, (module, cls) in ALGORITHMS.items():
-            candidate = path.with_name(f"{name}.yml")
-            if (base.__module__, base.__name__) == (module, cls) and candidate.is_file():
-                return candidate
-    if issubclass(algorithm(algo), FederatedPPO):
-        return path.with_name("local.yml")  # plain PPO, whatever the algorithm adds
-    raise ValueError(f"there are no settings for {algo}; give a YAML file with -conf")
+    cls = algorithm(algo)
+    for name in (*registered_names(cls), cls.base_settings):
+        if name is not None and (path := folder / f"{name}.yml").is_file():
+            return path
+    raise ValueError(f"there are no settings for {algo}; give a YAML file with -conf, or settings in register_algorithm()")
 
 
 def read_config(path: Path) -> dict[str, dict[str, Any]]:

@@ -10,7 +10,7 @@ import types
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import pydantic
 
@@ -27,78 +27,6 @@ NOT_HYPERPARAMETERS = {
 #: A value that falls linearly to zero over the run, as in rl-baselines3-zoo; or one until a share of the run is over, then
 #: zero.
 SCHEDULE = re.compile(r"^(?P<kind>lin|until)_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)?)$")
-
-ACTIVATIONS = {"tanh": "Tanh", "relu": "ReLU", "elu": "ELU", "leaky_relu": "LeakyReLU", "silu": "SiLU"}
-
-
-Layers = Annotated[list[Annotated[int, pydantic.Field(gt=0, le=8192)]], pydantic.Field(max_length=16)]
-
-
-class NetworkConfig(pydantic.BaseModel):
-    """``policy_kwargs`` as plain data.
-
-    :param net_arch: hidden layers of actor and critic, ``[64, 64]`` or ``{pi: [64, 64], vf: [64, 64]}``
-    :param activation_fn: by name
-    :param log_std_init: initial log standard deviation
-    :param ortho_init: orthogonal initialisation
-    """
-
-    model_config = pydantic.ConfigDict(extra="forbid", strict=True)
-
-    net_arch: Layers | dict[Literal["pi", "vf"], Layers] | None = None
-    activation_fn: Literal["tanh", "relu", "elu", "leaky_relu", "silu"] = "tanh"
-    log_std_init: pydantic.FiniteFloat = 0.0
-    ortho_init: bool = True
-
-    @pydantic.field_validator("net_arch", mode="after")
-    @classmethod
-    def _both_networks(cls, value: Any) -> Any:
-        if isinstance(value, dict) and set(value) != {"pi", "vf"}:
-            raise ValueError("needs both pi and vf")
-        return value
-
-    def to_kwargs(self) -> dict[str, Any]:
-        """Keyword arguments of SB3's policy."""
-        from torch import nn
-
-        kwargs = self.model_dump(exclude_none=True)
-        kwargs["activation_fn"] = getattr(nn, ACTIVATIONS[self.activation_fn])
-        return kwargs
-
-
-class DeterministicNetworkConfig(pydantic.BaseModel):
-    """``policy_kwargs`` of a deterministic policy as plain data.
-
-    :param net_arch: hidden layers of actor and critic, ``[64, 64]`` or ``{pi: [64, 64], qf: [64, 64]}``
-    :param activation_fn: by name
-    """
-
-    model_config = pydantic.ConfigDict(extra="forbid", strict=True)
-
-    net_arch: Layers | dict[Literal["pi", "qf"], Layers] | None = None
-    activation_fn: Literal["tanh", "relu", "elu", "leaky_relu", "silu"] = "relu"
-
-    @pydantic.field_validator("net_arch", mode="after")
-    @classmethod
-    def _both_networks(cls, value: Any) -> Any:
-        if isinstance(value, dict) and set(value) != {"pi", "qf"}:
-            raise ValueError("needs both pi and qf")
-        return value
-
-    def to_kwargs(self) -> dict[str, Any]:
-        """Keyword arguments of SB3's policy."""
-        from torch import nn
-
-        kwargs = self.model_dump(exclude_none=True)
-        kwargs["activation_fn"] = getattr(nn, ACTIVATIONS[self.activation_fn])
-        return kwargs
-
-
-def network_config(algorithm: type) -> type[NetworkConfig] | type[DeterministicNetworkConfig]:
-    """The model of an algorithm's ``policy_kwargs``."""
-    from sb3_fedguide.common.federated_ddpg import FederatedDDPG
-
-    return DeterministicNetworkConfig if issubclass(algorithm, FederatedDDPG) else NetworkConfig
 
 
 def hyperparameters(algorithm: type) -> dict[str, tuple[Any, Any]]:

@@ -95,3 +95,8 @@ def _unreadable(path: Path, error: Exception) -> Exception:
     if isinstance(error, OSError) and error.strerror:
         return ValueError(f"{path} cannot be read: {error.strerror}")
     return ValueError(f"{path} is damaged: {error}")
+
+
+def take_prefix(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin with ``prefix``, without it."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

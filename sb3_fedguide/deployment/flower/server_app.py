@@ -13,11 +13,11 @@ from flwr.app import Context
 from flwr.serverapp import Grid, ServerApp
 from tensorboard.summary import Writer
 
-from sb3_fedguide.cli.run import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.deployment.config import ServerConfig
 from sb3_fedguide.deployment.flower.certificates import read_public_key
 from sb3_fedguide.deployment.flower.transport import FlowerTransport
 from sb3_fedguide.deployment.serve import TooFewClients, serve
+from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 
 #: Environment variable with the path of what the server is told. Flower's own run configuration would go to the clients.
 CONFIG = "FEDGUIDE_SERVER_CONFIG"

@@ -20,7 +20,6 @@ from flwr.supercore.fab import Fab
 from flwr.supercore.runtime import RuntimeHttpClient
 
 from sb3_fedguide import __version__
-from sb3_fedguide.cli.run import EXIT_FAILED
 from sb3_fedguide.deployment.flower.certificates import CA, LOOPBACK, SERVER, SERVER_KEY
 from sb3_fedguide.deployment.flower.processes import (
     FlowerProcess,
@@ -31,6 +30,7 @@ from sb3_fedguide.deployment.flower.processes import (
 )
 from sb3_fedguide.deployment.flower.proxy import FleetProxy, ProxyServer
 from sb3_fedguide.deployment.flower.server_app import CONFIG
+from sb3_fedguide.exit_codes import EXIT_FAILED
 
 _POLL_SECONDS = 0.2
 _START_SECONDS = 120.0
