@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import typing
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.settings import schema
 from sb3_fedguide.settings.config import CONFIGURATIONS, config_path, parse_params, read_config, resolve
+from sb3_fedguide.settings.signatures import constructors
 
 BANDIT = fed_envs.load_family("Bandit2D")
 
@@ -208,3 +211,20 @@ def test_wrong_values_are_refused_with_the_remedy(overrides, message):
 def test_wrong_files_are_refused_with_the_reason(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
         resolve("local", BANDIT, write(tmp_path / "wrong.yml", text))
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_signatures_show_and_type_checkers_know_every_parameter(algo):
+    cls = algorithm(algo)
+    shown = inspect.signature(cls).parameters
+    assert list(shown)[:2] == ["policy", "env"] and {"learning_rate", "rollout_size", "seed"} < set(shown)
+    assert not any(parameter.kind is parameter.VAR_KEYWORD for parameter in shown.values())
+    constructor = next(iter(constructors(cls)))
+    own = inspect.signature(constructor).parameters
+    keywords = [name for name, parameter in own.items() if parameter.kind is parameter.VAR_KEYWORD]
+    for keyword in keywords:  # a TypedDict, with every parameter that is left and its type
+        told = typing.get_type_hints(typing.get_args(typing.get_type_hints(constructor)[keyword])[0])
+        assert set(shown) - set(own) <= set(told) and not set(own) & set(told)
+        assert {name: shown[name].annotation for name in set(shown) - set(own)} == {
+            name: told[name] for name in set(shown) - set(own)
+        }

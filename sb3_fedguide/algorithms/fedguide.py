@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from fed_envs.state import State
 from sb3_fedguide.algorithms.fedguide_parts import begin_parts, held_parts, part_arrays, set_part_arrays
-from sb3_fedguide.common.arguments import FederatedPPOArguments
+from sb3_fedguide.common.arguments import FederatedPPOArguments, FedGuideAArguments
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.parameter_averaging import ParameterAveraging
@@ -370,9 +370,9 @@ class FedGuideA(ParameterAveraging, FedGuide):
         env: FederationLike | None,
         average: Literal["all", "actor", "critic"] = "actor",
         average_every: int = 5,
-        **fedguide: object,
+        **fedguide: Unpack[FedGuideAArguments],
     ) -> None:
-        super().__init__(policy, env, average=average, average_every=average_every, **fedguide)  # type: ignore[arg-type]
+        super().__init__(policy, env, average=average, average_every=average_every, **fedguide)  # type: ignore[misc]
 
 
 def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Unpack
 
 from sb3_fedguide.algorithms.fedavg import FedAvg
+from sb3_fedguide.common.arguments import FedGuideRArguments
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 
 
@@ -29,6 +30,6 @@ class FedGuideR(FedAvg):
         env: FederationLike | None,
         server_step: float | Literal["exp"] = 2.0,
         screening: float = 0.05,
-        **fedavg: object,
+        **fedavg: Unpack[FedGuideRArguments],
     ) -> None:
-        super().__init__(policy, env, server_step=server_step, screening=screening, **fedavg)  # type: ignore[arg-type]
+        super().__init__(policy, env, server_step=server_step, screening=screening, **fedavg)

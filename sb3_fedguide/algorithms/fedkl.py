@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Unpack
+
 import numpy as np
 import torch as th
 
 from sb3_fedguide.algorithms.fedprox import AnchoredFedAvg
 from sb3_fedguide.common.anchors import actor_at
+from sb3_fedguide.common.arguments import FedAvgArguments
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.rollout_buffer import FederatedSamples
 
@@ -37,7 +40,7 @@ class FedKL(AnchoredFedAvg):
         env: FederationLike | None,
         lambda_global: float = 0.1,
         lambda_local: float = 0.05,
-        **fedavg: object,
+        **fedavg: Unpack[FedAvgArguments],
     ) -> None:
         for name, weight in (("lambda_global", lambda_global), ("lambda_local", lambda_local)):
             if not 0 <= weight < np.inf:

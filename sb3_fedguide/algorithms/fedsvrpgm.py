@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Unpack
+
 import numpy as np
 import torch as th
 
 from sb3_fedguide.algorithms.fedavg import FedAvg
 from sb3_fedguide.common.anchors import Parameters, actor_at, snapshot
+from sb3_fedguide.common.arguments import FedAvgArguments
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES, StackedActor
 from sb3_fedguide.common.rollout_buffer import FederatedSamples
@@ -45,7 +48,7 @@ class FedSVRPGM(FedAvg):
         env: FederationLike | None,
         beta: float = 0.2,
         reference_every: int = 5,
-        **fedavg: object,
+        **fedavg: Unpack[FedAvgArguments],
     ) -> None:
         if not 0.0 <= beta <= 1.0:
             raise ValueError(f"beta={beta} must lie in [0, 1]: it is the weight of the plain gradient; 1 is FedAvg")
@@ -64,7 +67,7 @@ class FedSVRPGM(FedAvg):
         self._momentum_tensors: dict[str, th.Tensor] = {}
         self._direction_sums: dict[str, th.Tensor] = {}
         self._n_directions = 0
-        super().__init__(policy, env, **fedavg)  # type: ignore[arg-type]
+        super().__init__(policy, env, **fedavg)
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 import torch as th
 from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_fedguide.common.normalization import Normalize
+from sb3_fedguide.server.averaging import Aggregator
 from sb3_fedguide.settings.pretraining import PretrainingConfig
 
 
@@ -66,3 +67,59 @@ class FederatedDDPGArguments(FederationArguments, total=False):
 
 class LearnerArguments(FederatedPPOArguments, FederatedDDPGArguments, total=False):
     """Those of either learner, for methods that stand on both; the constructors refuse the other's."""
+
+
+class _WhatIsAveraged(TypedDict, total=False):
+    average: Literal["all", "actor", "critic"]
+    average_every: int
+
+
+class _HowFarAndTested(TypedDict, total=False):
+    server_step: float | Literal["exp"]
+    screening: float
+
+
+class _HowItIsAveraged(TypedDict, total=False):
+    average_until: int | None
+    aggregator: Aggregator
+    trim_fraction: float
+    server_momentum: float
+    mix: float | Schedule
+
+
+class AveragingArguments(_WhatIsAveraged, _HowFarAndTested, _HowItIsAveraged, total=False):
+    """Those of :class:`~sb3_fedguide.common.parameter_averaging.ParameterAveraging`."""
+
+
+class FedAvgArguments(AveragingArguments, FederatedPPOArguments, total=False):
+    """Those of :class:`~sb3_fedguide.algorithms.fedavg.FedAvg`."""
+
+
+class FedGuideRArguments(_WhatIsAveraged, _HowItIsAveraged, FederatedPPOArguments, total=False):
+    """Those of FedAvg for which :class:`~sb3_fedguide.algorithms.fedguide_r.FedGuideR` has no default of its own."""
+
+
+class FedGuideArguments(FederatedPPOArguments, total=False):
+    """Those of :class:`~sb3_fedguide.algorithms.fedguide.FedGuide`."""
+
+    lambda_trust: float
+    lambda_prior: float
+    prior_horizon: int
+    prior_loss: Literal["snis", "sample"]
+    prior_states: int | None
+    density_steps: int
+    sampling_steps: int
+    beta: float | Schedule | Literal["auto"]
+    critic_target: Literal["online", "blend"]
+    calibrate: bool
+    n_experts: int | None
+    eta: float
+    cost: Literal["score", "param"]
+    cost_scaling: Literal["max", "median"]
+    adapt: Literal["none", "advantage"]
+    adapt_temperature: float
+    adapt_weight: float
+
+
+class FedGuideAArguments(_HowFarAndTested, _HowItIsAveraged, FedGuideArguments, total=False):
+    """Those of its bases for which :class:`~sb3_fedguide.algorithms.fedguide.FedGuideA` has no default of its own."""

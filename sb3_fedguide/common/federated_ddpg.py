@@ -81,7 +81,7 @@ class FederatedDDPG(Federation, DDPG):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": StackedDDPGPolicy}
     network_config: ClassVar[type[NetworkConfig]] = DeterministicNetworkConfig
-    #: whose settings an algorithm of one\'s own starts from that has none
+    #: whose settings an algorithm of the user's own starts from, where it has none
     base_settings: ClassVar[str | None] = None
     replay_buffer: FederatedReplayBuffer | None  # type: ignore[assignment]
     policy: StackedDDPGPolicy

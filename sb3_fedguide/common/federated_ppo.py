@@ -75,7 +75,7 @@ class FederatedPPO(Federation, PPO):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": StackedMlpPolicy}
     network_config: ClassVar[type[NetworkConfig]] = StochasticNetworkConfig
-    #: whose settings an algorithm of one\'s own starts from that has none
+    #: whose settings an algorithm of the user's own starts from, where it has none
     base_settings: ClassVar[str | None] = "local"
     rollout_buffer: FederatedRolloutBuffer  # type: ignore[assignment]
     policy: StackedMlpPolicy

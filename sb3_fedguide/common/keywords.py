@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import inspect
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -12,6 +11,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_fedguide.common.stacked_policy import StackedPolicy
+from sb3_fedguide.settings.signatures import CompleteSignature, parameters
 
 _NO_SDE = "exploration noise is drawn by each client's own random stream, independently in every step"
 _NO_FEATURES = "lockstep policies see flat observations as they are; extract features in a wrapper around the environments"
@@ -60,7 +60,7 @@ def check_keywords(cls: type, given: Iterable[str]) -> None:
     """:raises ValueError: for a keyword of SB3's constructor that ``cls`` does not take
     :raises TypeError: for any other that it does not know
     """
-    known = _constructor_names(cls)
+    known = set(parameters(cls))
     for name in given:
         if name not in known:
             reasons = {**UNSUPPORTED, **_OFF_POLICY} if issubclass(cls, OffPolicyAlgorithm) else UNSUPPORTED
@@ -89,7 +89,7 @@ def check_policy_keywords(policy_class: type, given: Mapping[str, Any]) -> None:
     """:raises ValueError: for ``policy_kwargs`` that SB3's policies take and ``policy_class`` does not
     :raises TypeError: for any other that it does not know
     """
-    known = _constructor_names(policy_class) - {"observation_space", "action_space", "lr_schedule", "n_clients", "init_seed"}
+    known = set(parameters(policy_class)) - {"observation_space", "action_space", "lr_schedule", "n_clients", "init_seed"}
     for name in given:
         if name not in known:
             _refuse(name, known, "policy_kwargs")
@@ -103,21 +103,10 @@ def _refuse(name: str, known: set[str], where: str, reasons: Mapping[str, str] =
     raise TypeError(f"{where} has no argument {name!r}{hint}")
 
 
-def _constructor_names(cls: type) -> set[str]:
-    """Keywords that the constructors of ``cls`` take, from the first up to one that hands nothing on."""
-    names: set[str] = set()
-    for base in cls.__mro__:
-        if "__init__" not in vars(base):
-            continue
-        parameters = inspect.signature(vars(base)["__init__"]).parameters.values()
-        names |= {parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD} - {"self"}
-        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-            break
-    return names
-
-
 class CheckedKeywords(BaseAlgorithm):
-    """Mixin: keywords are looked at before any constructor, so that none of them passes an unknown one on and on."""
+    """Mixin: keywords are checked before any constructor runs, and the signature shows all of them."""
+
+    __signature__ = CompleteSignature()
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         check_keywords(cls, kwargs)

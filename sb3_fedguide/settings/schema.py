@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 import operator
 import re
 import types
@@ -17,10 +16,11 @@ import pydantic
 from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.settings.names import check_names
 from sb3_fedguide.settings.ranges import check_range
+from sb3_fedguide.settings.signatures import parameters
 
 #: Constructor parameters that have a flag of their own or no meaning on the command line.
 NOT_HYPERPARAMETERS = {
-    "self", "policy", "env", "clients", "num_threads", "cache_dir", "tensorboard_log", "verbose", "seed", "device",
+    "policy", "env", "clients", "num_threads", "cache_dir", "tensorboard_log", "verbose", "seed", "device",
     "_init_setup_model",
 }  # fmt: skip
 
@@ -31,19 +31,11 @@ SCHEDULE = re.compile(r"^(?P<kind>lin|until)_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)
 
 def hyperparameters(algorithm: type) -> dict[str, tuple[Any, Any]]:
     """Name to (type, default) of every hyperparameter of an algorithm, its own first, then those of its bases."""
-    found: dict[str, tuple[Any, Any]] = {}
-    for cls in algorithm.__mro__:
-        if "__init__" not in cls.__dict__:
-            continue
-        constructor: Callable[..., None] = cls.__dict__["__init__"]
-        hints = typing.get_type_hints(constructor)
-        signature = inspect.signature(constructor).parameters.values()
-        for parameter in signature:
-            if parameter.name not in NOT_HYPERPARAMETERS and parameter.kind is not parameter.VAR_KEYWORD:
-                found.setdefault(parameter.name, (hints.get(parameter.name, Any), parameter.default))
-        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature):
-            break  # the first constructor that hands nothing on states every remaining parameter
-    return found
+    return {
+        name: (parameter.annotation, parameter.default)
+        for name, parameter in parameters(algorithm).items()
+        if name not in NOT_HYPERPARAMETERS
+    }
 
 
 def all_names() -> list[str]:
