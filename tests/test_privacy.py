@@ -72,9 +72,10 @@ def uploads(monkeypatch):
 def offline_uploads(monkeypatch):
     """Moments and trunks that clients send in the offline stage."""
     seen: dict[str, list[dict[str, np.ndarray]]] = {"moments": [], "trunk": []}
-    merge, average = trunk_module.merge_moments, trunk_module.average_uploads
+    merge, average = trunk_module.merge_moments, trunk_module.weighted_average
     monkeypatch.setattr(trunk_module, "merge_moments", lambda sent: (seen["moments"].extend(sent), merge(sent))[1])
-    monkeypatch.setattr(trunk_module, "average_uploads", lambda sent, n: (seen["trunk"].extend(sent), average(sent, n))[1])
+    weigh = lambda sent, *rest: (seen["trunk"].extend(sent), average(sent, *rest))[1]  # noqa: E731
+    monkeypatch.setattr(trunk_module, "weighted_average", weigh)
     return seen
 
 

@@ -13,7 +13,7 @@ import sb3_fedguide
 from sb3_fedguide.deployment.metrics import ClientEvaluation, count_tests
 from sb3_fedguide.deployment.serve import Server, TooFewClients
 from sb3_fedguide.deployment.transport import Failure, Message
-from sb3_fedguide.server.averaging import weighted_average
+from sb3_fedguide.server.averaging import combine
 from sb3_fedguide.server.build import complete_settings
 from sb3_fedguide.state.checkpoint_files import checkpoints
 from tests.loop_transport import CONFIG, NAME, STATED, Client, LoopTransport, replaced, run, timeout
@@ -26,7 +26,7 @@ def expected(n_rounds: int = 5, clients: tuple[int, ...] = (0, 1, 2, 3)) -> np.n
     for round in range(1, n_rounds + 1):
         moved = [theta + np.random.default_rng([client, round]).normal(size=3) for client in clients]
         uploads = {k: {**upload(0), NAME: own.astype(np.float32)} for k, own in enumerate(moved)}
-        theta = weighted_average(uploads, [NAME])[NAME]
+        theta = combine(uploads, [NAME], "mean", 0.0)[NAME]
     return theta
 
 

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from sb3_fedguide.server.averaging import Averaging, weighted_average
+from sb3_fedguide.server.averaging import Averaging, combine
 from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW, OTMoE, farthest_points, scale_cost, sinkhorn_plan
 from sb3_fedguide.server.strategy import N_SAMPLES, Composite
 
@@ -166,8 +166,8 @@ def upload(value, n, name="action_net.weight"):
 
 def test_average_is_weighted_by_samples_and_independent_of_order():
     uploads = {0: upload(1.0, 100), 1: upload(3.0, 300)}
-    np.testing.assert_allclose(weighted_average(uploads, ["action_net.weight"])["action_net.weight"], 2.5)
-    backwards = weighted_average({1: uploads[1], 0: uploads[0]}, ["action_net.weight"])
+    np.testing.assert_allclose(combine(uploads, ["action_net.weight"], "mean", 0.0)["action_net.weight"], 2.5)
+    backwards = combine({1: uploads[1], 0: uploads[0]}, ["action_net.weight"], "mean", 0.0)
     np.testing.assert_array_equal(backwards["action_net.weight"], np.full((2, 2), 2.5, dtype=np.float32))
 
 

@@ -10,7 +10,7 @@ from sb3_fedguide import FedAvg, FedGuide, FedGuideA, FedGuideR, FedRL, Local, P
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.newcomers import start_from
 from sb3_fedguide.common.normalization import FederatedNormalizer
-from sb3_fedguide.server.averaging import Averaging, fedexp_step, weighted_average
+from sb3_fedguide.server.averaging import Averaging, combine, fedexp_step
 from sb3_fedguide.server.moments import Moments, ObservationMoments, merge
 from sb3_fedguide.server.payload import N_SAMPLES, OBSERVATION_COUNT, OBSERVATION_MEAN, OBSERVATION_VAR
 from tests.conftest import assert_same_parameters, parameters_of
@@ -66,7 +66,7 @@ def test_a_step_of_one_is_the_average_bit_for_bit():
     for round in range(1, 4):
         uploads = {k: {"w": rng.normal(size=7).astype(np.float32), N_SAMPLES: np.float32(k + 1)} for k in range(3)}
         sent = plain.aggregate(round, uploads)
-        np.testing.assert_array_equal(sent[1]["w"], weighted_average(uploads, ["w"])["w"])
+        np.testing.assert_array_equal(sent[1]["w"], combine(uploads, ["w"], "mean", 0.0)["w"])
 
 
 def test_server_step_and_momentum_against_their_recursion():

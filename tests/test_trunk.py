@@ -8,13 +8,13 @@ import torch as th
 
 from sb3_fedguide.offline.trunk import (
     TrunkTraining,
-    average_uploads,
     federated_trunk,
     merge_moments,
     observation_moments,
     upload_size,
 )
 from sb3_fedguide.priors import DiffusionPrior
+from sb3_fedguide.server.averaging import weighted_average
 
 RNG = np.random.default_rng
 
@@ -45,7 +45,7 @@ def test_merged_moments_are_those_of_the_union():
 
 def test_uploads_are_averaged_by_samples():
     uploads = [{"w": np.float32([1.0, 2.0])}, {"w": np.float32([5.0, 4.0])}]
-    average = average_uploads(uploads, [300, 100])
+    average = weighted_average(uploads, [300, 100], ["w"])
     np.testing.assert_allclose(average["w"], [2.0, 2.5])
     assert average["w"].dtype == np.float32
 
@@ -64,7 +64,8 @@ def test_lockstep_is_separate_sites_that_exchange_uploads(action_dim):
     while sites[0].n_done < 12:
         for site in sites:
             site.run(5)
-        average = average_uploads([site.uploads()[0] for site in sites], [len(part.actions) for part in data])
+        sent = [site.uploads()[0] for site in sites]
+        average = weighted_average(sent, [len(part.actions) for part in data], sent[0])
         for site in sites:
             site.receive(average)
     for name, value in together.trunk.state_dict().items():
@@ -85,7 +86,7 @@ def test_heads_stay_local_and_trunks_become_one():
     training = TrunkTraining(small_prior(), [dataset(0), dataset(1)], rngs(0, 1), 10, batch_size=32)
     training.run(10)
     heads = training.head.weight.detach().clone()
-    training.receive(average_uploads(training.uploads(), [1, 1]))
+    training.receive(weighted_average(sent := training.uploads(), [1, 1], sent[0]))
     first, second = training.uploads()
     assert all(np.array_equal(first[name], second[name]) for name in first)
     assert th.equal(training.head.weight, heads) and not th.equal(heads[0], heads[1])

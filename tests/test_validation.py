@@ -208,8 +208,10 @@ def test_aggregators_against_their_definitions(n):
         cut = int(fraction * n)
         expected = np.sort(stacked, axis=0)[cut : n - cut].mean(axis=0)
         np.testing.assert_allclose(combine(uploads, ["x"], "trimmed_mean", fraction)["x"], expected, rtol=1e-5, atol=1e-7)
-    mean = combine(uploads, ["x"], "mean", 0.25)["x"]
-    np.testing.assert_array_equal(mean, weighted_average(uploads, ["x"])["x"])
+    counts = [1 + k for k in range(n)]
+    mean = weighted_average(list(uploads.values()), counts, ["x"])["x"]
+    np.testing.assert_array_equal(combine(uploads, ["x"], "mean", 0.25)["x"], mean)
+    np.testing.assert_allclose(mean, np.average(stacked, axis=0, weights=counts), rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("aggregator", ["median", "trimmed_mean"])

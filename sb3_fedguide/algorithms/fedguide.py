@@ -35,8 +35,8 @@ ACTION_MARGIN = 0.1
 class FedGuide(FederatedPPO):
     """Federated policy optimisation guided by distribution-space priors and an offline value baseline.
 
-    Every client regularises PPO towards its personal prior, a mixture of diffusion priors (paper, Eq. personalized-prior),
-    and computes advantages from a blend of its critic and a frozen DICE value (Eq. Vblend). Only the linear head of the
+    Every client regularises PPO towards its personal prior, a mixture of diffusion priors (paper, Eq. 10),
+    and computes advantages from a blend of its critic and a frozen DICE value (Eq. 12). Only the linear head of the
     client's prior and its row of transport costs leave it. Round by round the loss is
 
     ``L = PPO + vf_coef * MSE(V) + lambda_trust * KL(pi_old || pi) + lambda_prior(h) * R_prior``.
@@ -199,7 +199,7 @@ class FedGuide(FederatedPPO):
         online = buffer.rows(buffer.values)
         beta = self._blend_weights(returns, online, dice)
 
-        blended = buffer.unrows(beta[:, None] * online + (1 - beta)[:, None] * dice)  # Eq. Vblend
+        blended = buffer.unrows(beta[:, None] * online + (1 - beta)[:, None] * dice)  # Eq. 12
         dice_last = np.stack([self._dice_values(i, last_raw_obs[i]) for i in range(self.n_clients)])
         blended_last = beta[:, None] * last_values + (1 - beta)[:, None] * dice_last
         blended_truncations = np.array(
@@ -209,7 +209,7 @@ class FedGuide(FederatedPPO):
             ],
             dtype=np.float32,
         )
-        buffer.advantages[:] = generalized_advantage(  # Eq. GAE
+        buffer.advantages[:] = generalized_advantage(  # Eq. 13
             buffer.bootstrapped_rewards(self.gamma, blended_truncations),
             blended.astype(np.float32),
             blended_last.astype(np.float32),
@@ -310,9 +310,11 @@ class FedGuide(FederatedPPO):
         losses = {}
         if self.lambda_trust > 0:
             old = data.extras["old_mean"], self._old_log_std
+            # Eq. 11, first regulariser: KL(pi_old || pi)
             kl = self.policy.distribution.kl_divergence(*old, mean, self.policy.log_std)
             losses["trust_loss"] = self.lambda_trust * kl.mean(dim=1)
         if "prior_weights" in data.extras:
+            # Eq. 11, prior regulariser: E_{a ~ prior}[-log pi(a | s)] by self-normalised importance weights
             cross_entropy = -(data.extras["prior_weights"] * log_prob).mean(dim=1)
             losses["prior_loss"] = self._prior_weight * cross_entropy
         elif "prior_actions" in data.extras:

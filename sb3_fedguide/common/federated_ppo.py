@@ -361,6 +361,7 @@ class FederatedPPO(Federation, PPO):
                 log_ratio = log_prob - data.old_log_prob
                 ratio = th.exp(log_ratio)
                 clipped = th.clamp(ratio, 1 - clip_range, 1 + clip_range)
+                # clipped surrogate (paper, Eq. 14; Schulman et al. 2017, Eq. 7)
                 policy_loss = -th.min(advantages * ratio, advantages * clipped).mean(dim=1)
                 if clip_range_vf is not None:
                     change = th.clamp(values - data.old_values, -clip_range_vf, clip_range_vf)

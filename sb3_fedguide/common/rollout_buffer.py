@@ -40,7 +40,7 @@ def generalized_advantage(
     gamma: float,
     gae_lambda: float,
 ) -> np.ndarray:
-    """GAE (paper, Eq. GAE) with any baseline, in SB3's operations and order.
+    """Generalized advantage estimation (paper, Eq. 13) with any baseline, in SB3's operations and order.
 
     Rewards of truncated steps already contain ``gamma * V(final observation)``, as in SB3.
 

@@ -106,11 +106,6 @@ class OfflineData:
             following = returns[row] = rewards[row] + gamma * following
         return returns
 
-    def episode_returns(self) -> np.ndarray:
-        """Undiscounted returns of the recorded episodes, ``(n_episodes,)``, cut ones included."""
-        starts = np.concatenate([[0], np.flatnonzero(self.episode_ends)[:-1] + 1])
-        return np.add.reduceat(self.rewards.astype(np.float64), starts)
-
 
 def normalize_observations(
     observations: np.ndarray, mean: np.ndarray, var: np.ndarray, clip: float = 10.0, epsilon: float = 1e-8

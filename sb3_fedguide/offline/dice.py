@@ -1,4 +1,4 @@
-"""The DICE value function of the offline data, for all clients in lockstep (DESIGN 5.2; paper, section on the offline critic).
+"""The DICE value function of the offline data, for all clients in lockstep (paper, Eq. 4 to 6).
 
 With ``y = (min(Q1, Q2)_target(s, a) - V(s)) / omega``::
 
@@ -25,7 +25,7 @@ from sb3_fedguide.offline.data import OfflineData
 from sb3_fedguide.offline.groups import client_groups, train_together
 from sb3_fedguide.offline.progress import StepProgress
 
-__all__ = ["DiceValue", "calibrate", "explained_variance", "train_dice"]
+__all__ = ["DiceValue", "calibrate", "train_dice"]
 
 _MIN_STD = 1e-3
 _BLOCK = 250  # updates whose minibatches are drawn at once, and between two reports of progress
@@ -118,12 +118,6 @@ class DiceValue(nn.Module):
         x = (th.as_tensor(observations, dtype=th.float32) - self.obs_mean[index]) / self.obs_std[index]
         with th.no_grad():
             return (self.offset[index] + self.scale[index] * self.net.client(index, x)).numpy()
-
-    def unstack(self, index: int) -> DiceValue:
-        """A copy with only the client at ``index``."""
-        one = DiceValue(1, self.obs_dim, self.width)
-        one.load_state_dict({name: tensor[index : index + 1] for name, tensor in self.state_dict().items()})
-        return one.requires_grad_(False)
 
     @classmethod
     def stack(cls, clients: Sequence[DiceValue]) -> DiceValue:
@@ -229,6 +223,7 @@ def _train_group(
             with th.no_grad():
                 q_min = q_values(q_target, twice).amin(dim=1)
             v = value.standardized(state)
+            # Eq. 6, first line
             v_loss = (v_weight * v + omega * f_conjugate((q_min - v) / omega)) / value.scale
             v_optimizer.zero_grad(set_to_none=True)
             v_loss.mean(dim=1).sum().backward()
@@ -238,7 +233,7 @@ def _train_group(
                 q_goal = reward + discount * value.standardized(next_state)
             q_error = (q_values(q_net, twice) - q_goal.unsqueeze(1)) / scale
             q_optimizer.zero_grad(set_to_none=True)
-            q_error.square().mean(dim=2).sum().backward()
+            q_error.square().mean(dim=2).sum().backward()  # Eq. 6, second line
             q_optimizer.step()
             with th.no_grad():
                 th._foreach_lerp_(target_parameters, q_parameters, tau)
@@ -299,20 +294,6 @@ def calibrate(values: np.ndarray, returns: np.ndarray) -> tuple[float, float]:
         return 1.0, float(returns.mean() - values.mean())
     slope = float(((values - values.mean()) * (returns - returns.mean())).mean() / variance)
     return slope, float(returns.mean() - slope * values.mean())
-
-
-def explained_variance(value: DiceValue, datasets: Sequence[OfflineData], gamma: float) -> np.ndarray:
-    """``1 - Var(G - V) / Var(G)`` of each client's data, ``(N,)``; cut episodes are bootstrapped with V itself.
-
-    The constant part of V's error is not in it: that is what :func:`calibrate` removes.
-    """
-    result = np.full(len(datasets), np.nan)
-    for k, data in enumerate(datasets):
-        values = value.client_values(k, data.observations)
-        returns = data.discounted_returns(gamma, value.client_values(k, data.next_observations))
-        if returns.var() > 0:
-            result[k] = 1.0 - np.var(returns - values) / returns.var()
-    return result
 
 
 def _check(

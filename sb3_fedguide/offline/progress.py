@@ -8,7 +8,7 @@ from typing import Protocol
 
 from tqdm.auto import tqdm
 
-__all__ = ["Progress", "StepProgress", "TqdmProgress", "silent", "stage_progress"]
+__all__ = ["Progress", "StepProgress", "TqdmProgress", "stage_progress"]
 
 StepProgress = Callable[[int, int], None]
 """Called with the steps done so far and their total."""
@@ -18,10 +18,6 @@ class Progress(Protocol):
     """Called with the stage's name, the steps done so far and their total; the last call has ``done == total``."""
 
     def __call__(self, stage: str, done: int, total: int) -> None: ...
-
-
-def silent(stage: str, done: int, total: int) -> None:
-    """Reports nothing."""
 
 
 class TqdmProgress:

@@ -23,14 +23,14 @@ from sb3_fedguide.offline.progress import StepProgress
 from sb3_fedguide.priors.density import training_angle
 from sb3_fedguide.priors.diffusion import DiffusionPrior
 from sb3_fedguide.priors.trunk_network import DiffusionTrunk
-from sb3_fedguide.server.trunk import average_uploads, merge_moments
+from sb3_fedguide.server.averaging import weighted_average
+from sb3_fedguide.server.trunk import merge_moments
 from sb3_fedguide.state.optimizer_state import load_optimizer, optimizer_state
 from sb3_fedguide.state.stacked import StackedLinear, client_state, stack_module, to_arrays, to_tensors
 
 __all__ = [
     "TrunkResult",
     "TrunkTraining",
-    "average_uploads",
     "federated_trunk",
     "merge_moments",
     "observation_moments",
@@ -231,7 +231,7 @@ def federated_trunk(
         parts = train_together([job(training) for training in trainings])
         losses.append(np.concatenate(parts))
         uploads = [upload for training in trainings for upload in training.uploads()]
-        trunk = average_uploads(uploads, n_samples)
+        trunk = weighted_average(uploads, n_samples, uploads[0])
         for training in trainings:
             training.receive(trunk)
         upload_bytes += upload_size(uploads[0])

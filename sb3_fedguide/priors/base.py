@@ -211,7 +211,9 @@ class Prior(nn.Module, ABC):
 
 
 def score_cost(head: np.ndarray, experts: np.ndarray, moment: np.ndarray) -> np.ndarray:
-    """A client's row of the transport cost, ``C_im = E_{D_i} |score_i - score_m|^2 = tr(dW S_i dW^T)``, without error.
+    """A client's row of the transport cost, ``C_im = E_{D_i} |score_i - score_m|^2`` (paper, Eq. 7).
+
+    With a common trunk it is ``tr(dW S_i dW^T)``, without error.
 
     :param head: the client's own head, ``(action_dim, p + 1)``
     :param experts: ``(n_experts, action_dim, p + 1)``

@@ -9,7 +9,7 @@ FLOOR_NATS = 20.0
 
 
 def importance_weights(log_ratio: np.ndarray, supported: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-    """Truncated, self-normalised weights ``w_t = pibar(a_t|s_t) / pi_old(a_t|s_t)`` over a whole sample.
+    """Truncated, self-normalised weights ``w_t = pibar(a_t|s_t) / pi_old(a_t|s_t)`` over a whole sample (paper, below Eq. 11).
 
     ``E[w | s] = 1`` in every state, so one normaliser serves all states. Weights above ``sqrt(n)`` times their mean are
     truncated there (Ionides 2008).

@@ -19,7 +19,7 @@ def mixture_log_prob(
     min_weight: float = MIN_WEIGHT,
     n_steps: int | None = None,
 ) -> th.Tensor:
-    """``log sum_m R_m p_m(a|s)`` of one client.
+    """``log sum_m R_m p_m(a|s)`` of one client (paper, Eq. 10).
 
     :param experts: heads, ``(n_experts, action_dim, p + 1)``
     :param row: the client's weights ``R_i``, ``(n_experts,)``, summing to one

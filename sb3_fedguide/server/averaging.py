@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -15,16 +15,17 @@ Aggregator = Literal["mean", "median", "trimmed_mean"]
 AGGREGATORS: tuple[Aggregator, ...] = get_args(Aggregator)
 
 
-def weighted_average(uploads: Mapping[int, Payload], names: list[str]) -> Payload:
-    """``sum_i n_i / n * theta_i`` for the arrays ``names``, accumulated in float64 in the order of client ids."""
-    clients = sorted(uploads)
-    counts = np.array([float(uploads[client][N_SAMPLES]) for client in clients])
-    weights = counts / counts.sum()
+def weighted_average(parts: Sequence[Mapping[str, np.ndarray]], counts: Sequence[float], names: Iterable[str]) -> Payload:
+    """``sum_i n_i / n * theta_i`` for the arrays ``names``, accumulated in float64 in the order of ``parts``; float32.
+
+    :param counts: n_i, the samples of each part
+    """
+    weights = np.asarray(counts, dtype=np.float64) / np.sum(counts, dtype=np.float64)
     average = {}
     for name in names:
-        total = np.zeros(uploads[clients[0]][name].shape)
-        for client, weight in zip(clients, weights, strict=True):
-            total += weight * uploads[client][name]
+        total = np.zeros(parts[0][name].shape)
+        for part, weight in zip(parts, weights, strict=True):
+            total += weight * part[name]
         average[name] = total.astype(np.float32)
     return average
 
@@ -41,7 +42,8 @@ def combine(
     Median and trimmed mean count every client once, whatever number of samples it claims.
     """
     if aggregator == "mean":
-        return weighted_average(uploads, names)
+        parts = [uploads[client] for client in sorted(uploads)]
+        return weighted_average(parts, [float(part[N_SAMPLES]) for part in parts], names)
     stacks = {name: np.stack([uploads[client][name] for client in sorted(uploads)]) for name in names}
     return {name: robust_mean(stack, aggregator, trim_fraction).astype(np.float32) for name, stack in stacks.items()}
 

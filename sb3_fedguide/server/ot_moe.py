@@ -48,7 +48,7 @@ def sinkhorn_plan(
     column_marginal: np.ndarray | None = None,
     start: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> TransportPlan:
-    """Entropic optimal transport plan (paper, Eq. ot-plan) by POT's log-domain Sinkhorn.
+    """Entropic optimal transport plan (paper, Eq. 8) by POT's log-domain Sinkhorn.
 
     Near a permutation the iterations converge like ``1 / k``: thousands of them. So POT iterates in short runs, each of which
     starts from the last one's potentials after a Newton step (:func:`_newton_step`) that the iterations would creep along.
@@ -149,7 +149,7 @@ def head_shares(plan: np.ndarray) -> np.ndarray:
     """What the other clients' mixtures hold of each client's head, on average: ``1 / n_clients`` where all share alike.
 
     Client j's mixture weighs expert m with ``P_jm / sum_m P_jm``, and that expert weighs client i's head with
-    ``P_im / sum_i P_im`` (paper, Eq. expert-update and personalized-prior).
+    ``P_im / sum_i P_im`` (paper, Eq. 9 and 10).
 
     :param plan: ``(n_clients, n_experts)``
     :return: ``(n_clients,)``
@@ -196,12 +196,12 @@ class OTMoE(Strategy):
 
     Before the first round it takes two exchanges: heads come up and the first experts go down, then the clients' cost
     rows come up and the first mixture rows go down. After every round the experts become column-weighted averages of the
-    clients' heads (paper, Eq. expert-update) and client i's mixture weights its normalised row (Eq. personalized-prior).
+    clients' heads (paper, Eq. 9) and client i's mixture weights its normalised row (Eq. 10).
     A client that is absent keeps its row.
 
     :param n_experts: M
     :param eta: entropic regularisation of the scaled costs
-    :param cost: ``"score"``, rows of expected squared score distances that clients compute at home (Eq. ot-cost), or
+    :param cost: ``"score"``, rows of expected squared score distances that clients compute at home (Eq. 7), or
         ``"param"``, squared distances between heads that the server computes
     :param cost_scaling: divide costs by their ``"max"`` or by the ``"median"`` of the positive ones, which one outlier
         cannot flatten
@@ -249,8 +249,8 @@ class OTMoE(Strategy):
         raw = self._costs(heads, uploads, clients)
         cost = scale_cost(raw, self.cost_scaling)
         start = self._potentials if self._potentials is not None and len(self._potentials[0]) == len(clients) else None
-        self.plan, error, self._potentials = sinkhorn_plan(cost, self.eta, start=start)
-        rows = self.plan / self.plan.sum(axis=1, keepdims=True)
+        self.plan, error, self._potentials = sinkhorn_plan(cost, self.eta, start=start)  # Eq. 8, the transport plan
+        rows = self.plan / self.plan.sum(axis=1, keepdims=True)  # Eq. 10, weights of the personal prior
         self.rows.update(zip(clients, rows.astype(np.float32), strict=True))
         self._look_at_heads(clients, heads)
         if round > 0:  # the first plan routes to the seeded experts as they are
@@ -283,6 +283,7 @@ class OTMoE(Strategy):
         assert self.plan is not None and self.experts is not None
         load = self.plan.sum(axis=0)
         weights = self.plan / np.maximum(load, np.finfo(float).tiny)
+        # Eq. 9, expert update
         updated = np.tensordot(weights, heads.astype(np.float64), axes=(0, 0)).astype(np.float32)
         served = load > 1e-12  # an expert that nobody is routed to stays as it is
         self.experts = np.where(served.reshape(-1, *([1] * (heads.ndim - 1))), updated, self.experts)

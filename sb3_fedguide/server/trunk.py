@@ -10,6 +10,7 @@ import numpy as np
 
 from fed_envs.faults import ClientError
 from fed_envs.plain_data import State, freeze, thaw
+from sb3_fedguide.server.averaging import weighted_average
 from sb3_fedguide.server.moments import Moments, merge
 from sb3_fedguide.server.payload import N_SAMPLES, Payload
 from sb3_fedguide.server.validation import check_uploads
@@ -30,17 +31,6 @@ def merge_moments(uploads: Sequence[Mapping[str, np.ndarray]]) -> tuple[np.ndarr
     parts = [Moments(float(upload[N_SAMPLES]), upload["mean"], upload["var"]) for upload in uploads]
     merged = merge(parts)
     return merged.mean, np.sqrt(merged.var)
-
-
-def average_uploads(uploads: Sequence[Mapping[str, np.ndarray]], n_samples: Sequence[int]) -> Payload:
-    """FedAvg: the mean of the clients' parameters, weighted by their samples, in float64."""
-    weights = np.asarray(n_samples, dtype=np.float64) / np.sum(n_samples)
-    return {
-        name: np.sum([w * upload[name].astype(np.float64) for w, upload in zip(weights, uploads, strict=True)], axis=0).astype(
-            np.float32
-        )
-        for name in uploads[0]
-    }
 
 
 def moments_fault(moments: Payload) -> str | None:
@@ -121,7 +111,8 @@ class TrunkAverages:
             raise ClientError(
                 sorted(uploads), f"the server cannot average the trunk, because it rejects every upload: {reasons}"
             )
-        self.trunk = average_uploads([uploads[c] for c in accepted], [self.n_samples[c] for c in accepted])
+        parts, counts = [uploads[client] for client in accepted], [self.n_samples[client] for client in accepted]
+        self.trunk = weighted_average(parts, counts, parts[0])
         self.n_averages += 1
         return rejected
 
