@@ -10,6 +10,8 @@ RAY := $(VENV)/.ray-installed
 SITE := $(VENV)/.site-installed
 # Small networks gain nothing from threads, and threads of several libraries get into each other's way.
 export OMP_NUM_THREADS ?= 1
+# A worker of the test suite takes about a gigabyte; make test WORKERS= runs all tests in one process.
+WORKERS ?= --numprocesses auto --maxprocesses 4 --dist worksteal
 
 .PHONY: help install train demo test test-slow test-flower test-flower-slow test-ray lint type docs format clean
 
@@ -32,10 +34,10 @@ demo: $(RUNTIME)
 	$(BIN)/python -m sb3_fedguide demo --progress $(ARGS)
 
 test: $(TOOLS)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
 test-slow: $(TOOLS)
-	$(BIN)/python -m pytest -m "not ray and not flower and not flower_slow" $(ARGS)
+	FUZZ=1 $(BIN)/python -m pytest -m "not ray and not flower and not flower_slow" $(ARGS)
 
 test-flower: $(TOOLS) $(FLOWER)
 	$(BIN)/python -m pytest -m flower $(ARGS)

@@ -2,49 +2,30 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch as th
 
 from sb3_fedguide.common.federated_ppo import FederatedPPO
+from tests.environments import PointEnv
 
 th.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True)
 def private_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results of the offline stage are shared by the tests of one run and by nobody else."""
-    monkeypatch.setenv("FEDGUIDE_CACHE", str(tmp_path_factory.getbasetemp() / "fedguide-cache"))
-
-
-class PointEnv(gym.Env[np.ndarray, np.ndarray]):
-    """A point that is paid for staying near its client's target; cheap and with both ways for an episode to end."""
-
-    def __init__(self, target: float = 0.5, length: int = 20) -> None:
-        self.observation_space = gym.spaces.Box(-10.0, 10.0, (3,), np.float32)
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.target, self.length = target, length
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.position, self.steps = self.np_random.normal(size=2) * 0.5, 0
-        return self._observation(), {}
-
-    def step(self, action):
-        self.position = self.position + 0.2 * np.clip(action, -1, 1) + 0.02 * self.np_random.normal(size=2)
-        self.steps += 1
-        reward = -float(np.square(self.position - self.target).sum())
-        terminated = bool(np.abs(self.position).max() > 2.5)
-        return self._observation(), reward, terminated, self.steps >= self.length and not terminated, {}
-
-    def _observation(self) -> np.ndarray:
-        return np.array([*self.position, self.steps / self.length], dtype=np.float32)
+    """Results of the offline stage are shared by the tests of one run, whichever worker has them, and by nobody else."""
+    run = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        run = run.parent
+    monkeypatch.setenv("FEDGUIDE_CACHE", str(run / "fedguide-cache"))
+    monkeypatch.setenv("SB3_LOGDIR", str(run / "sb3"))  # else every model that learns leaves a folder in /tmp
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -60,6 +41,12 @@ def ends_first(clients: Iterable[tuple[str, int]]) -> list[Any]:
     ends = {name: (min(k for other, k in pairs if other == name), max(k for other, k in pairs if other == name))
             for name, _ in pairs}  # fmt: skip
     return [pytest.param(name, k, marks=() if k in ends[name] else pytest.mark.slow) for name, k in pairs]
+
+
+def others_slow(cases: Iterable[Any], default: Callable[..., bool]) -> list[Any]:
+    """Parameters of which only those that ``default`` chooses are no slow tests; it gets a tuple's entries one by one."""
+    entries = [case if isinstance(case, tuple) else (case,) for case in cases]
+    return [pytest.param(*entry, marks=() if default(*entry) else pytest.mark.slow) for entry in entries]
 
 
 def _point_env(target: float) -> gym.Env:

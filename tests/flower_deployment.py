@@ -19,6 +19,7 @@ import numpy as np
 import yaml
 
 import fed_envs
+from sb3_fedguide.settings.config import resolve
 
 TESTS = Path(__file__).parent
 #: Settings small enough for a test, the same for the server and its clients.
@@ -191,3 +192,35 @@ def _read(pid: int, name: str) -> str:
 def _parent(pid: int) -> int:
     stat = _read(pid, "stat")
     return int(stat.rpartition(")")[2].split()[1]) if stat else 0
+
+
+CLIENT = {
+    "algo": "fedguide", "env": "Bandit2D", "seed": 0, "client": 0, "server": "localhost:9443", "ca": "certificates/ca.crt",
+    "key": "a", "folder": "out",
+}  # fmt: skip
+
+
+def in_process(deployment: Deployment) -> dict[str, np.ndarray]:
+    """What the same clients learn in one process."""
+    common, family = deployment.common, fed_envs.load_family(deployment.metadata)
+    config = resolve(common["algo"], family, "tuned", None, {**common["params"], "n_rounds": common["n_rounds"]})
+    model = config.make(family, seed=0, verbose=0)
+    model.learn(config.n_rounds * model.rollout_size * model.n_clients)
+    path = deployment.folder / "in_process.npz"
+    model.export_parameters(path)
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def assert_same(deployment: Deployment) -> None:
+    """Every client has learned what it learns in process; it does the same sums in the same order."""
+    expected = in_process(deployment)
+    for client in range(deployment.n_clients):
+        learned = deployment.parameters(client)
+        assert learned.keys() == expected.keys()
+        for name in learned.keys() - {"header", "__sha256__"}:
+            alone, together = learned[name], expected[name]
+            if together.shape != alone.shape:  # stacked along the clients
+                together = together[client : client + 1]
+            difference = np.abs(alone.astype(np.float64) - together).max(initial=0.0)
+            assert difference <= 1e-5, f"{name} of client {client} differs by {difference}"

@@ -133,3 +133,7 @@ def run(config: ServerConfig = CONFIG, transport: LoopTransport | None = None, f
 
 def replaced(config: ServerConfig, **changes: Any) -> ServerConfig:
     return ServerConfig(**{**vars(config), **changes})
+
+
+def upload(value: float) -> dict[str, np.ndarray]:
+    return {NAME: np.full(3, value, dtype=np.float32), "n_samples": np.array(8, dtype=np.float32)}

@@ -17,23 +17,13 @@ from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES, CRITIC_PREFIXES
 from sb3_fedguide.seeding import stream
 from sb3_fedguide.server.strategy import N_SAMPLES
 from sb3_fedguide.server.svrpg import DIRECTION, SVRPG
-from tests.conftest import PointEnv, assert_same_parameters, parameters_of
+from tests.conftest import assert_same_parameters, others_slow, parameters_of
+from tests.environments import PointEnv
+from tests.small_runs import minibatch, perturb
 
 METHODS = {"fedprox": FedProx, "fedkl": FedKL, "fedsvrpgm": FedSVRPGM}
 #: Settings with which each method is FedAvg.
 NEUTRAL = {FedProx: {"mu": 0.0}, FedKL: {"lambda_global": 0.0, "lambda_local": 0.0}, FedSVRPGM: {"beta": 1.0}}
-
-
-def minibatch(model, size=16):
-    """One minibatch of the model's last rollout."""
-    return next(model.rollout_buffer.get(size, enumerate(np.random.default_rng(k) for k in range(model.n_clients))))
-
-
-def perturb(model, scale, seed=0):
-    generator = th.Generator().manual_seed(seed)
-    with th.no_grad():
-        for parameter in model.policy.parameters():
-            parameter.add_(scale * th.randn(parameter.shape, generator=generator))
 
 
 @pytest.mark.parametrize("cls", NEUTRAL)
@@ -274,7 +264,9 @@ def test_unfit_settings_are_refused(point_envs, small, cls, settings):
 @pytest.mark.parametrize("algo", METHODS)
 def test_command_line_end_to_end(algo, tmp_path: Path):
     argv = ["--algo", algo, "--env", "Bandit2D", "--rounds", "2", "-f", str(tmp_path), "--verbose", "0"]
-    assert main([*argv, "-params", "bc_weight:0.0", "n_envs_per_client:2"]) == 0
+    assert (
+        main([*argv, "-params", "bc_weight:0.0", "n_envs_per_client:2", "rollout_size:40", "batch_size:20", "n_epochs:1"]) == 0
+    )
     folder = tmp_path / algo / "Bandit2D_1"
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["finished"] and summary["rounds_done"] == 2 and summary["bytes_up"] > 0
@@ -282,7 +274,7 @@ def test_command_line_end_to_end(algo, tmp_path: Path):
     assert (model.round, model.n_clients) == (2, 4)
 
 
-@pytest.mark.parametrize("cls", METHODS.values())
+@pytest.mark.parametrize("cls", others_slow(METHODS.values(), lambda cls: cls is FedSVRPGM))
 def test_every_method_learns_a_bandit(cls, small):
     args = {**small, "rollout_size": 128, "batch_size": 32, "n_epochs": 4, "learning_rate": 3e-3}
     model = cls("MlpPolicy", "Bandit2D", **{**args, "policy_kwargs": {"net_arch": [16], "log_std_init": -1.0}})

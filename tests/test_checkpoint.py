@@ -24,7 +24,8 @@ from sb3_fedguide.common.checkpoint import (
     write_checkpoint,
 )
 from sb3_fedguide.state.array_files import read_arrays, write_arrays
-from tests.test_env_state import CountingEnv
+from tests.comparisons import same
+from tests.environments import CountingEnv
 
 STATE = {
     "numbers": [1, 0.1, None, True, "text"],
@@ -33,17 +34,6 @@ STATE = {
     "a/b": np.ones(1),
     "a": {"b": np.zeros(1)},  # the same path as the one before
 }
-
-
-def same(first, second) -> bool:
-    if isinstance(first, np.ndarray):
-        equal = isinstance(second, np.ndarray) and first.dtype == second.dtype and first.shape == second.shape
-        return equal and first.tobytes() == second.tobytes()
-    if isinstance(first, dict):
-        return first.keys() == second.keys() and all(same(first[name], second[name]) for name in first)
-    if isinstance(first, list):
-        return len(first) == len(second) and all(map(same, first, second))
-    return type(first) is type(second) and first == second
 
 
 def test_what_goes_in_comes_out(tmp_path):

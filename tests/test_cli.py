@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import re
+import runpy
 import shlex
 import signal
 import subprocess
@@ -143,8 +144,13 @@ def local_run(tmp_path_factory):
     """Two rounds of Local through the script itself."""
     folder = tmp_path_factory.mktemp("local")
     argv = ["train.py", "--algo", "local", *QUICK, "--seed", "5", *NO_OFFLINE, "n_epochs:2", "-f", str(folder)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    subprocess.run([sys.executable, *argv], check=True, cwd=ROOT, env=environment, capture_output=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        patch.setattr(sys, "argv", argv)
+        patch.setattr(sys, "orig_argv", [sys.executable, *argv])
+        with pytest.raises(SystemExit) as exit:
+            runpy.run_path("train.py", run_name="__main__")
+    assert exit.value.code == 0
     return folder / "local" / "Bandit2D_1"
 
 

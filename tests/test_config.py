@@ -38,10 +38,15 @@ def one_client():
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_shipped_configuration_constructs_what_it_says(algo, conf, one_client):
     assert set(read_config(config_path(conf, algo))) <= {"default", *fed_envs.FAMILIES}
+    made = []
     for name in fed_envs.FAMILIES:
         config = resolve(algo, fed_envs.load_family(name), conf)
         assert config.values.keys() == {"policy", "n_rounds", *schema.hyperparameters(algorithm(algo))}
-        model = config.make(one_client(name, config.values["n_envs_per_client"]), seed=0)
+        env = one_client(name, config.values["n_envs_per_client"])
+        if (config.values, env.observation_space, env.action_space) in made:
+            continue  # a family's hard clients as its others
+        made.append((config.values, env.observation_space, env.action_space))
+        model = config.make(env, seed=0)
         for parameter, value in config.values.items():
             if parameter not in ("policy", "n_rounds", "policy_kwargs", "pretraining", "stats_window_size", "clip_range"):
                 assert getattr(model, parameter) == schema.schedule_or_value(value), (name, parameter)

@@ -8,20 +8,7 @@ import numpy as np
 import pytest
 
 from sb3_fedguide.server.delays import Delays, DelaySettings, delay_settings, parse_delays
-
-NEVER = math.inf
-
-
-class Scripted(Delays):
-    """Clients whose rounds take as long as a list says; an infinite one is a lost upload."""
-
-    def __init__(self, settings: DelaySettings, seconds: list[list[float]]) -> None:
-        super().__init__(settings, 0, range(len(seconds)))
-        self.script = seconds
-
-    def draw(self, index: int) -> tuple[float, bool]:
-        seconds = self.script[index][self.begun[index]]
-        return seconds, seconds == NEVER
+from tests.scripted_delays import NEVER, Scripted
 
 
 def play(delays: Delays, rounds: int, client_fraction: float = 1.0) -> list[tuple[list[int], list[int], float]]:

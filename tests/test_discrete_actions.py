@@ -14,55 +14,12 @@ from sb3_fedguide import FedAvg, FederatedEvalCallback, FedGuide, FedKL, FedProx
 from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.distributions import Categorical, action_distribution
 from sb3_fedguide.monitoring.diagnostics import DiagnosticsCallback
+from tests.comparisons import assert_train_equals, sb3_twin
 from tests.conftest import assert_same_parameters, parameters_of
-from tests.test_engines import Here
-from tests.test_federated_ppo import assert_train_equals, sb3_twin
+from tests.environments import SPACES, ChoiceEnv, choices
+from tests.loop_engine import Here
 
 METHODS = [Local, FedAvg, FedProx, FedKL, FedSVRPGM]
-SPACES = {
-    "discrete": spaces.Discrete(4),
-    "multidiscrete": spaces.MultiDiscrete([2, 3]),
-    "multibinary": spaces.MultiBinary(3),
-}
-
-
-class ChoiceEnv(gym.Env):
-    """Paid for every entry of the action that is what the observation's signs ask for."""
-
-    def __init__(self, space: spaces.Space, shift: int = 0) -> None:
-        self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
-        self.action_space = space
-        self.sizes = {spaces.Discrete: lambda: [space.n], spaces.MultiDiscrete: lambda: space.nvec}.get(
-            type(space), lambda: [2] * 3
-        )()
-        self.shift, self.steps = shift, 0
-        self.position = np.zeros(3, dtype=np.float32)
-
-    def _draw(self):
-        self.position = self.np_random.normal(size=3).astype(np.float32)
-        return self.position.copy()
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return self._draw(), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action), action
-        wanted = [(int(x > 0) + self.shift) % size for x, size in zip(self.position, self.sizes, strict=False)]
-        reward = float(np.mean(np.reshape(action, -1) == wanted))
-        self.steps += 1
-        return self._draw(), reward, False, self.steps >= 8, {}
-
-    def save_state(self):
-        return {"position": self.position.copy(), "steps": self.steps}
-
-    def load_state(self, state):
-        self.position, self.steps = state["position"].copy(), state["steps"]
-
-
-def choices(kind: str, n: int = 2):
-    return [lambda k=k: ChoiceEnv(SPACES[kind], k) for k in range(n)]
 
 
 def cartpoles(n: int = 2):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -17,49 +18,21 @@ from sb3_fedguide.cli.train import main
 from sb3_fedguide.engines import make_engine
 from sb3_fedguide.engines.engine import Engine, EngineError
 from sb3_fedguide.engines.processes import Processes
-from sb3_fedguide.engines.worker import Worker
 from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.state.client_axis import join_clients, take_clients
-from tests.test_checkpoint import same
-from tests.test_env_state import CountingEnv
-from tests.test_resume import ROUNDS, make, train
+from tests.comparisons import assert_same_training, same
+from tests.conftest import others_slow
+from tests.environments import CountingEnv
+from tests.loop_engine import Here
+from tests.small_runs import ROUNDS, make, train
+
+FEDERATED = [name for name in ALGORITHMS if algorithm(name).is_federated]
+QUICK = [("local", 1.0), ("fedavg", 0.4), ("fedsvrpgm", 1.0), ("fedrl", 0.4), ("fedguide-a", 1.0), ("fedguide-r", 0.4)]
 
 
-class Here(Engine):
-    """The workers of the real engines, in this process."""
-
-    def _start(self, blobs):
-        self.workers = [Worker(blob) for blob in blobs]
-        self.asked = []
-
-    def _train(self, rounds):
-        self.asked.append(sorted(rounds))
-        return {k: self.workers[k].train(round) for k, round in rounds.items()}
-
-    def _end(self):
-        self.workers = []
-
-
-def without_clock(state):
-    """A state without seconds, and with the random streams that both have: an engine makes all of them at once."""
-    for infos in state["attributes"]["episode_infos"]:
-        for info in infos["value"]:
-            info.pop("t")
-    state["env"].pop("seconds")
-    state["attributes"].pop("_streams")
-    state.pop("random")  # the processes' own generators, which nothing draws from
-    return state
-
-
-def assert_same_training(plain, other) -> None:
-    for role, streams in plain._streams.items():
-        assert [s.bit_generator.state for s in streams] == [s.bit_generator.state for s in other._streams[role]]
-    plain.complete_state()
-    assert same(without_clock(plain.save_state()), without_clock(other.save_state()))
-
-
-@pytest.mark.parametrize("fraction", [1.0, 0.4])
-@pytest.mark.parametrize("algo", [name for name in ALGORITHMS if algorithm(name).is_federated])
+@pytest.mark.parametrize(
+    ("algo", "fraction"), others_slow(itertools.product(FEDERATED, (1.0, 0.4)), lambda *case: case in QUICK)
+)
 def test_groups_elsewhere_learn_the_same(algo, fraction, tmp_path):
     def run(engine: Engine | None):
         model = make(algo, "Reacher", clients=[0, 3, 4, 6, 7], client_fraction=fraction)
@@ -184,11 +157,13 @@ def test_wrong_engines_are_refused(arguments, message):
         make_engine(*arguments)
 
 
-def test_a_worker_process_that_is_killed(small):
+def test_worker_processes_leave_signals_to_the_main_process_and_one_that_is_killed_is_missed(small):
     plain, model = (Local("MlpPolicy", [lambda: CountingEnv(0.3)], **small) for _ in range(2))
     plain.learn(64)
     with Processes(2) as engine:
         engine.attach(model)
+        for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):  # a terminal and a scheduler send them to all
+            os.kill(engine._processes[0].pid, number)
         model.learn(64)
         assert_same_training(plain, model)
         processes = list(engine._processes)
@@ -205,9 +180,16 @@ SMALL_RUN = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("engine", ["processes", pytest.param("ray", marks=pytest.mark.ray)])
-def test_a_run_with_an_engine_writes_what_a_run_without_writes(engine, tmp_path):
-    for name, flags in (("lockstep", []), (engine, ["--engine", engine, "--num-actors", "2"])):
+@pytest.mark.parametrize(
+    ("engine", "workers"),
+    [
+        ("processes", "1"),
+        pytest.param("processes", "2", marks=pytest.mark.slow),
+        pytest.param("ray", "2", marks=pytest.mark.ray),
+    ],
+)
+def test_a_run_with_an_engine_writes_what_a_run_without_writes(engine, workers, tmp_path):
+    for name, flags in (("lockstep", []), (engine, ["--engine", engine, "--num-actors", workers])):
         assert main([*SMALL_RUN, "-f", str(tmp_path / name), *flags]) == 0
     plain, other = (tmp_path / name / "fedguide" / "Bandit2D_1" for name in ("lockstep", engine))
     assert (plain / "evaluations.csv").read_bytes() == (other / "evaluations.csv").read_bytes()

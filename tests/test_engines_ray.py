@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from sb3_fedguide import FedAvg, Local
-from tests.test_engines import assert_same_training
-from tests.test_env_state import CountingEnv
+from tests.comparisons import assert_same_training
+from tests.environments import CountingEnv
 
 pytestmark = pytest.mark.ray
 CLIENTS = [lambda target=target: CountingEnv(target) for target in (-0.3, 0.0, 0.3)]

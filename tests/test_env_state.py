@@ -14,7 +14,7 @@ import fed_envs
 from fed_envs import FederatedVecEnv
 from fed_envs.metadata import Family, parse_family
 from fed_envs.state import freeze, generator, gives_state, load_state, save_state, thaw
-from tests.conftest import PointEnv
+from tests.environments import CountingEnv, PointEnv
 
 #: An episode's steps here, and the steps before the state is taken: in mid-episode, but for the one-step bandit.
 LIMITS, BEFORE, AFTER = {"metaworld": 12, "bandit2d": 1}, 7, 45
@@ -115,16 +115,6 @@ def test_environments_that_are_away_keep_their_state():
     for env in (old, new):
         env.active[:] = True
     assert record(new, actions) == record(old, actions)
-
-
-class CountingEnv(PointEnv):
-    """A user's own environment that can be put back."""
-
-    def save_state(self):
-        return {"position": self.position, "steps": self.steps}
-
-    def load_state(self, state):
-        self.position, self.steps = state["position"], state["steps"]
 
 
 def counting_env(target: float) -> gymnasium.Env:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import pickle
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,8 @@ from sb3_fedguide import FedAvg, FedRL, Local
 from sb3_fedguide.cli import train
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.faults import check_experience
-from tests.conftest import PointEnv
+from tests import forked
+from tests.environments import PointEnv
 
 SMALL = {"rollout_size": 60, "batch_size": 30, "n_envs_per_client": 2, "seed": 3}
 LEARNERS = {
@@ -230,11 +229,10 @@ def test_the_command_line_prints_one_message_and_writes_no_result(tmp_path):
     fault, message = "self.rewards[1] = np.nan", "client 0, round 2: its environment returned a reward that is not finite"
     root = Path(__file__).parents[1]
     (tmp_path / "broken_world.py").write_text(BROKEN_WORLD.format(at=40, fault=fault))
-    command = [sys.executable, str(root / "train.py"), "--gym-packages", "wind_world", "broken_world", "--algo", "fedavg"]
-    command += ["--env", "Wind", "--rounds", "5", "--verbose", "0", "-f", str(tmp_path / "logs"), "--no-eval"]
-    command += ["-params", "rollout_size:60", "batch_size:20", "n_envs_per_client:2", "bc_weight:0"]
-    environment = {"PYTHONPATH": f"{tmp_path}:{root / 'docs' / 'examples'}", "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1"}
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=root, env=environment)
+    argv = ["--gym-packages", "wind_world", "broken_world", "--algo", "fedavg"]
+    argv += ["--env", "Wind", "--rounds", "5", "--verbose", "0", "-f", str(tmp_path / "logs"), "--no-eval"]
+    argv += ["-params", "rollout_size:60", "batch_size:20", "n_envs_per_client:2", "bc_weight:0"]
+    result = forked.train(argv, [tmp_path, root / "docs" / "examples"])
     assert result.returncode == train.EXIT_FAILED, result.stderr
     (error,) = result.stderr.splitlines()
     assert error.startswith(f"train.py: error: {message}")

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-import os
 import pickle
-import subprocess
-import sys
 import warnings
 
 import gymnasium
@@ -20,6 +17,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import fed_envs
 from tests.conftest import ends_first
+from tests.rendering import check_pictures, run_with_osmesa
 
 CLIENTS = [(name, k) for name in fed_envs.FAMILIES for k in range(fed_envs.load_family(name).n_clients)]
 LEGGED = [(name, k) for name, k in CLIENTS if fed_envs.load_family(name).world == "locomotion"]
@@ -346,30 +344,20 @@ def test_wrong_action_shapes_are_value_errors():
         env.step(np.zeros((1, 3), dtype=np.float32))
 
 
-RENDER = """
-import numpy as np, fed_envs
-for name in ("HopperHard", "Walker2DHard", "HalfCheetahHard", "ReacherHard"):
-    env = fed_envs.load_family(name).make(1, render_mode="rgb_array", width=160, height=120)
-    env.reset(seed=0)
-    first = env.render()
-    for _ in range(8):
-        env.step(env.action_space.sample())
-    assert first.shape == (120, 160, 3) and first.dtype == np.uint8 and first.std() > 5, name
-    assert (env.render() != first).any(), name
-    env.close()
+SLOW_PICTURES = [pytest.param(name, marks=pytest.mark.slow) for name in ("Walker2DHard", "HalfCheetahHard", "ReacherHard")]
+
+
+@pytest.mark.parametrize("name", ["HopperHard", *SLOW_PICTURES])
+def test_rgb_arrays_without_a_display(name):
+    check_pictures(name)
+
+
+@pytest.mark.slow  # tests of FederatedVecEnv have Bandit2D's pictures
+def test_pictures_of_several_clients():
+    run_with_osmesa("""
+import fed_envs
 clients = fed_envs.FederatedVecEnv("ReacherHard", clients=[0, 5], render_mode="rgb_array")
 clients.reset()
 assert [image.shape for image in clients.get_images()] == [(480, 480, 3)] * 2
 clients.close()
-print("rendered")
-"""
-
-
-def test_rgb_arrays_without_a_display():
-    """In a process of its own, since MuJoCo chooses its OpenGL when it is imported."""
-    environment = {**os.environ, "MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
-    probe = subprocess.run([sys.executable, "-c", "import mujoco"], env=environment, capture_output=True, check=False)
-    if probe.returncode:
-        pytest.skip("no display-less OpenGL here (Debian: libosmesa6)")
-    result = subprocess.run([sys.executable, "-c", RENDER], env=environment, capture_output=True, text=True, check=False)
-    assert result.stdout.strip() == "rendered", result.stderr
+""")

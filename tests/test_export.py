@@ -21,8 +21,8 @@ from sb3_fedguide.common.spaces import describe_space, space_from
 from sb3_fedguide.deployment.serve import ServerConfig, serve
 from sb3_fedguide.deployment.site import PARAMETERS, SITE, Site
 from sb3_fedguide.state.array_files import write_arrays
+from tests.environments import SPACES, choices
 from tests.loop_transport import LoopTransport
-from tests.test_discrete_actions import SPACES, choices
 
 DDPG_SETTINGS = {"rollout_size": 40, "learning_starts": 20, "batch_size": 8, "seed": 3}
 

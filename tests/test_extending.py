@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium
@@ -19,6 +17,7 @@ from fed_envs.metadata import parse_family
 from sb3_fedguide.cli.evaluate import main as evaluate
 from sb3_fedguide.cli.train import main
 from sb3_fedguide.registry import ALGORITHMS, register_algorithm
+from tests import forked
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs" / "examples"
@@ -46,9 +45,8 @@ def test_the_page_shows_the_file(name):
 
 
 def test_the_example_trains_from_the_command_line(tmp_path):
-    command = [sys.executable, str(ROOT / "train.py"), "--gym-packages", "half_averaging", "--algo", "half-averaging"]
-    command += ["--env", "Bandit2D", "-f", str(tmp_path), *SMALL]
-    result = subprocess.run(command, cwd=EXAMPLES, capture_output=True, text=True, timeout=120)
+    argv = ["--gym-packages", "half_averaging", "--algo", "half-averaging", "--env", "Bandit2D", "-f", str(tmp_path), *SMALL]
+    result = forked.train(argv, [EXAMPLES])
     assert result.returncode == 0, result.stderr
     summary = json.loads((tmp_path / "half-averaging" / "Bandit2D_1" / "summary.json").read_text())
     assert summary["rounds_done"] == 2 and summary["bytes_up"] > 0
@@ -100,10 +98,9 @@ def test_the_example_world_keeps_the_contracts(monkeypatch, registries):
 
 
 def test_fedguide_trains_in_the_example_world(tmp_path, capsys):
-    command = [sys.executable, str(ROOT / "train.py"), "--gym-packages", "wind_world", "--env", "Wind", "-f", str(tmp_path)]
-    command += [*SMALL[:-1], "pretraining.dataset_size:200", "pretraining.bc_updates:5", "pretraining.prior_updates:5"]
-    command += ["pretraining.dice_updates:5", "prior_states:20"]
-    result = subprocess.run(command, cwd=EXAMPLES, capture_output=True, text=True, timeout=120)
+    argv = ["--gym-packages", "wind_world", "--env", "Wind", "-f", str(tmp_path)]
+    argv += [*SMALL[:-1], "pretraining.dataset_size:200", "pretraining.bc_updates:5", "pretraining.prior_updates:5"]
+    result = forked.train([*argv, "pretraining.dice_updates:5", "prior_states:20"], [EXAMPLES])
     assert result.returncode == 0, result.stderr
     summary = json.loads((tmp_path / "fedguide" / "Wind_1" / "summary.json").read_text())
     assert summary["n_clients"] == 3 and summary["rounds_done"] == 2

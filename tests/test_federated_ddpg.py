@@ -20,16 +20,7 @@ from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
 from sb3_fedguide.common.replay_buffer import FederatedReplayBuffer
 from sb3_fedguide.seeding import Role
 from tests.conftest import assert_same_parameters, parameters_of
-
-SMALL = {
-    "rollout_size": 64,
-    "batch_size": 16,
-    "learning_starts": 32,
-    "seed": 3,
-    "tau": 0.01,
-    "learning_rate": 1e-3,
-    "policy_kwargs": {"net_arch": [16, 16]},
-}
+from tests.small_runs import SMALL
 
 # The code of Stable-Baselines3 that FederatedDDPG reimplements in lockstep. When this fails after an upgrade of SB3, read
 # what changed there, carry it over, and update the digest.

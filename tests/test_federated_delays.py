@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -13,12 +14,13 @@ from sb3_fedguide.cli.train import main
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.participation import ParticipationAdam, simulate_delays
-from sb3_fedguide.engines.processes import Processes
 from sb3_fedguide.server.averaging import Averaging
 from sb3_fedguide.server.delays import Delays, DelaySettings, parse_delays
 from sb3_fedguide.server.rounds import Rounds
 from sb3_fedguide.server.strategy import Composite
-from tests.test_delays import NEVER, Scripted
+from tests.conftest import others_slow
+from tests.loop_engine import Here
+from tests.scripted_delays import NEVER, Scripted
 
 SMALL = {"rollout_size": 16, "batch_size": 16, "n_epochs": 1, "seed": 3, "policy_kwargs": {"net_arch": [8]}}
 OFFLINE = {"dataset_size": 50, "bc_updates": 2, "dice_updates": 2, "dice_width": 8, "dice_batch_size": 16, "prior_updates": 2}
@@ -72,8 +74,14 @@ def trained(kind, settings: str | Delays | None, rounds: int = 4, more: list | N
     return model, watch
 
 
-@pytest.mark.parametrize("kind", [Local, FedAvg, FedGuide, FedRL])
-@pytest.mark.parametrize("settings", ["sync:spread=0,jitter=0", "sync:spread=2", "deadline:deadline=inf,spread=1"])
+KINDS = (Local, FedAvg, FedGuide, FedRL)
+PATIENT = ("sync:spread=0,jitter=0", "sync:spread=2", "deadline:deadline=inf,spread=1")
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    others_slow(itertools.product(KINDS, PATIENT), lambda kind, settings: kind is FedAvg or settings == PATIENT[1]),
+)
 def test_who_waits_for_everybody_gets_the_plain_federation(kind, settings):
     plain, delayed = trained(kind, None, 3), trained(kind, settings, 3)
     np.testing.assert_array_equal(plain[1].after, delayed[1].after)
@@ -206,13 +214,14 @@ def test_a_saved_model_goes_on_with_its_clock(tmp_path):
     assert model.delays.rounds == 1
 
 
-def test_worker_processes_train_only_those_who_are_not_busy():
+def test_workers_elsewhere_train_only_those_who_are_not_busy():
     here, _ = trained(FedAvg, "async:tick=30,spread=1,dropout=0.2", 5)
     apart = FedAvg("MlpPolicy", "Bandit2D", **SMALL)
     simulate_delays(apart, parse_delays("async:tick=30,spread=1,dropout=0.2"))
-    with Processes(2) as engine:
-        engine.attach(apart)
-        apart.learn(5 * 64)
+    engine = Here(4)
+    engine.attach(apart)
+    apart.learn(5 * 64)
+    assert any(len(asked) < 4 for asked in engine.asked)
     assert apart.round == 5 and apart.num_timesteps == here.num_timesteps and apart.delays.seconds == here.delays.seconds
     for own, other in zip(here.policy.parameters(), apart.policy.parameters(), strict=True):
         np.testing.assert_array_equal(own.detach(), other.detach())

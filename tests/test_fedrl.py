@@ -18,7 +18,7 @@ from sb3_fedguide.seeding import Role
 from sb3_fedguide.server.averaging import Averaging
 from sb3_fedguide.server.strategy import N_SAMPLES
 from tests.conftest import assert_same_parameters, parameters_of
-from tests.test_federated_ddpg import SMALL
+from tests.small_runs import SMALL
 
 
 class Spy(RoundCallback):

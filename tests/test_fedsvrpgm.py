@@ -11,7 +11,7 @@ from sb3_fedguide.common import gaussian
 from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES
 from sb3_fedguide.server.svrpg import DIRECTION
 from tests.conftest import parameters_of
-from tests.test_baselines import minibatch, perturb
+from tests.small_runs import minibatch, perturb
 
 
 def test_the_direction_in_closed_form():

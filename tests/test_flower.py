@@ -6,40 +6,11 @@ import os
 import signal
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-import fed_envs
-from sb3_fedguide.settings.config import resolve
-from tests.flower_deployment import Deployment
+from tests.flower_deployment import Deployment, assert_same
 
 pytestmark = pytest.mark.flower
-
-
-def in_process(deployment: Deployment) -> dict[str, np.ndarray]:
-    """What the same clients learn in one process."""
-    common, family = deployment.common, fed_envs.load_family(deployment.metadata)
-    config = resolve(common["algo"], family, "tuned", None, {**common["params"], "n_rounds": common["n_rounds"]})
-    model = config.make(family, seed=0, verbose=0)
-    model.learn(config.n_rounds * model.rollout_size * model.n_clients)
-    path = deployment.folder / "in_process.npz"
-    model.export_parameters(path)
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
-
-
-def assert_same(deployment: Deployment) -> None:
-    """Every client has learned what it learns in process; it does the same sums in the same order."""
-    expected = in_process(deployment)
-    for client in range(deployment.n_clients):
-        learned = deployment.parameters(client)
-        assert learned.keys() == expected.keys()
-        for name in learned.keys() - {"header", "__sha256__"}:
-            alone, together = learned[name], expected[name]
-            if together.shape != alone.shape:  # stacked along the clients
-                together = together[client : client + 1]
-            difference = np.abs(alone.astype(np.float64) - together).max(initial=0.0)
-            assert difference <= 1e-5, f"{name} of client {client} differs by {difference}"
 
 
 def test_same_as_in_process_though_a_supernode_is_killed(tmp_path: Path) -> None:

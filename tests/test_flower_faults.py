@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.flower_deployment import SMALL, Deployment
-from tests.test_flower import assert_same
+from tests.flower_deployment import SMALL, Deployment, assert_same
 
 pytestmark = pytest.mark.flower_slow
 

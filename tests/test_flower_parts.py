@@ -16,7 +16,7 @@ import yaml
 
 from sb3_fedguide.cli.main import main as fedguide
 from sb3_fedguide.deployment.transport import Failure, Message
-from tests.flower_deployment import SMALL
+from tests.flower_deployment import CLIENT, SMALL
 
 pytestmark = pytest.mark.flower
 
@@ -40,11 +40,6 @@ SERVER = {
     "algo": "fedguide", "env": "Bandit2D", "seed": 0, "clients": {0: "a.pub", 1: "b.pub"}, "certificates": "certificates",
     "folder": "out",
 }  # fmt: skip
-CLIENT = {
-    "algo": "fedguide", "env": "Bandit2D", "seed": 0, "client": 0, "server": "localhost:9443", "ca": "certificates/ca.crt",
-    "key": "a", "folder": "out",
-}  # fmt: skip
-
 WRONG = [
     ("server", {"algo": "fedgiude"}, "Did you mean 'fedguide'"),
     ("server", {"algo": None}, "algo"),

@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from sb3_fedguide.cli.main import main as fedguide
-from tests.test_flower_parts import CLIENT
+from tests.flower_deployment import CLIENT
 
 pytestmark = pytest.mark.flower
 

@@ -6,6 +6,7 @@ Nothing is on the disk in either case, since a run writes only when it is called
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,8 @@ from sb3_fedguide.settings.pretraining import PretrainingConfig
 
 
 def fuzz(max_examples: int) -> settings:
+    """A third of the examples, or with ``$FUZZ`` all, as in ``make test-slow``."""
+    max_examples = max_examples if os.environ.get("FUZZ") else max_examples // 3
     quiet = [HealthCheck.function_scoped_fixture]
     return settings(max_examples=max_examples, derandomize=True, deadline=None, database=None, suppress_health_check=quiet)
 

@@ -19,8 +19,8 @@ from sb3_fedguide.cli.train import main
 from sb3_fedguide.deployment.site_config import make_client, read_site_config
 from sb3_fedguide.offline.make_dataset import make_dataset
 from tests.conftest import assert_same_parameters
-from tests.test_engines import Here
-from tests.test_make_dataset import ACTIONS, pendulum_log
+from tests.environments import ACTIONS, pendulum_log
+from tests.loop_engine import Here
 
 SMALL = ["--eval-episodes", "2", "--verbose", "0", "-params", "rollout_size:60", "batch_size:30", "n_envs_per_client:1",
          "n_epochs:1", "policy_kwargs.net_arch:[4]"]  # fmt: skip

@@ -98,3 +98,17 @@ def test_imports_run_down(package: str) -> None:
 def test_every_package_has_its_layer() -> None:
     packages = {path.parent.name for path in (ROOT / "sb3_fedguide").glob("*/__init__.py")}
     assert packages == set(LAYERS) - {"fed_envs"}
+
+
+def test_test_modules_do_not_import_each_other() -> None:
+    """What several tests need is in a module of its own; importing a test module repeats its tests' set-up."""
+    for path in (ROOT / "tests").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = []
+            if isinstance(node, ast.ImportFrom):
+                module = "." * node.level + (node.module or "")
+                names = [module, *(f"{module}.{alias.name}" for alias in node.names)]
+            elif isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            for name in names:
+                assert not any(part.startswith("test_") for part in name.split(".")), f"{path.name} imports {name}"

@@ -93,7 +93,7 @@ def run(algorithm: type, arguments: dict, envs, folder: Path) -> tuple[Keys, dic
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory) -> dict[tuple[str, int], tuple[Keys, dict]]:
-    from tests.conftest import PointEnv
+    from tests.environments import PointEnv
 
     envs = [lambda: gym.wrappers.RecordEpisodeStatistics(Success(PointEnv(length=10)))] * 2
     with pytest.MonkeyPatch.context() as patch:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -16,31 +14,16 @@ from sb3_fedguide.cli.main import main as fedguide
 from sb3_fedguide.cli.train import main as train
 from sb3_fedguide.offline.make_dataset import make_dataset, read_log
 from sb3_fedguide.offline.minari_io import find_dataset, read_minari
+from tests import forked
+from tests.environments import ACTIONS, pendulum_log
 
 ROOT = Path(__file__).parents[1]
-ACTIONS = gym.spaces.Box(-2.0, 2.0, (1,))
 
 
 @pytest.fixture(autouse=True)
 def datasets(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     return tmp_path / "minari"
-
-
-def pendulum_log(seed: int, n: int = 90) -> dict[str, np.ndarray]:
-    """Three episodes of a pendulum, the last two of which are cut off."""
-    env, rng = gym.make("Pendulum-v1"), np.random.default_rng(seed)
-    rows = {name: [] for name in ("observations", "actions", "rewards", "next_observations")}
-    for episode in range(3):
-        observation = env.reset(seed=seed + episode)[0]
-        for _ in range(n // 3):
-            action = rng.uniform(-2, 2, 1).astype(np.float32)
-            following, reward, *_ = env.step(action)
-            for name, value in zip(rows, (observation, action, reward, following), strict=True):
-                rows[name].append(value)
-            observation = following
-    log = {name: np.asarray(values, dtype=np.float32) for name, values in rows.items()}
-    return log | {"terminations": np.arange(n) == n // 3 - 1, "truncations": np.arange(n) % (n // 3) == n // 3 - 1}
 
 
 def write_csv(path: Path, log: dict[str, np.ndarray]) -> None:
@@ -152,11 +135,8 @@ WindEnv.scripted_policy = classmethod(lambda cls, family, client: None)
 
 def test_a_world_without_data_is_told_so_before_anything_is_written(tmp_path):
     (tmp_path / "silent_world.py").write_text(WORLD)
-    command = [sys.executable, str(ROOT / "train.py"), "--gym-packages", "silent_world", "--env", "Wind", "-f"]
-    environment = {"PYTHONPATH": f"{tmp_path}:{ROOT / 'docs' / 'examples'}", "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1"}
-    result = subprocess.run(
-        [*command, str(tmp_path / "logs")], capture_output=True, text=True, timeout=120, cwd=ROOT, env=environment
-    )
+    argv = ["--gym-packages", "silent_world", "--env", "Wind", "-f", str(tmp_path / "logs")]
+    result = forked.train(argv, [tmp_path, ROOT / "docs" / "examples"])
     assert result.returncode == 2
     (error,) = result.stderr.splitlines()
     assert "no behaviour policy for 'Wind'" in error and "scripted_policy (docs/extending.md)" in error

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import copy
-import os
 import pickle
-import subprocess
-import sys
 import warnings
 
 import gymnasium
@@ -19,6 +16,7 @@ import fed_envs
 from fed_envs.clients import METAWORLD_TASKS
 from fed_envs.metadata import parse_family
 from fed_envs.metaworld10 import MetaWorldEnv
+from tests.rendering import run_with_osmesa
 
 FAMILY = fed_envs.load_family("MetaWorld10")
 CLIENTS = range(10)
@@ -228,7 +226,7 @@ def test_noise_of_the_scripted_policy():
 
 
 def test_images_show_the_goal_from_the_first_frame_on():
-    code = """
+    run_with_osmesa("""
 import numpy as np
 import fed_envs
 env = fed_envs.load_family("MetaWorld10").make(6, render_mode="rgb_array", width=160, height=120)
@@ -244,11 +242,4 @@ for _ in range(2):
     a, b = env.step(np.ones(4, dtype=np.float32)), twin.step(np.ones(4, dtype=np.float32))
     env.render()
     assert a[0].tolist() == b[0].tolist()
-print("rendered")
-"""
-    environment = {**os.environ, "MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
-    probe = subprocess.run([sys.executable, "-c", "import mujoco"], env=environment, capture_output=True, check=False)
-    if probe.returncode:
-        pytest.skip("no display-less OpenGL here (Debian: libosmesa6)")
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
-    assert result.stdout.strip() == "rendered", result.stderr
+""")

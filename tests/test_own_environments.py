@@ -16,9 +16,10 @@ from sb3_fedguide import FedAvg, FedRL, Local
 from sb3_fedguide.common.callbacks import RoundProgressCallback
 from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.evaluation import FederatedEvalCallback, evaluate_federation
-from tests.conftest import PointEnv, assert_same_parameters
-from tests.test_engines import Here, assert_same_training
-from tests.test_env_state import CountingEnv
+from tests.comparisons import assert_same_training
+from tests.conftest import assert_same_parameters
+from tests.environments import CountingEnv, PointEnv
+from tests.loop_engine import Here
 
 SMALL = {"rollout_size": 30, "batch_size": 15, "seed": 3}
 ROUND = 2 * SMALL["rollout_size"]

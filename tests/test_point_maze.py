@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import subprocess
 import sys
 
 import gymnasium
@@ -22,6 +21,7 @@ from fed_envs.mazes import FREE, MAZES, WALL, cell_center, distances, free_cells
 from fed_envs.metadata import Family, parse_family
 from fed_envs.point_maze import PointMazeEnv
 from tests.conftest import ends_first
+from tests.rendering import check_pictures
 
 FAMILIES = ("PointMaze", "PointMazeHard")
 CLIENTS = [(name, k) for name in FAMILIES for k in range(8)]
@@ -271,29 +271,9 @@ def test_broken_clients_are_refused(fields, message):
         family({"maze": "Open", "goal_cells": [[1, 1]], **fields})
 
 
-RENDER = """
-import numpy as np, fed_envs
-for name in ("PointMaze", "PointMazeHard"):
-    env = fed_envs.load_family(name).make(1, render_mode="rgb_array", width=160, height=120)
-    env.reset(seed=0)
-    first = env.render()
-    for _ in range(20):
-        env.step(np.ones(2, dtype=np.float32))
-    assert first.shape == (120, 160, 3) and first.dtype == np.uint8 and first.std() > 5, name
-    assert (env.render() != first).any(), name
-    env.close()
-print("rendered")
-"""
-
-
-def test_rgb_arrays_without_a_display():
-    """In a process of its own, since MuJoCo chooses its OpenGL when it is imported."""
-    environment = {**os.environ, "MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
-    probe = subprocess.run([sys.executable, "-c", "import mujoco"], env=environment, capture_output=True, check=False)
-    if probe.returncode:
-        pytest.skip("no display-less OpenGL here (Debian: libosmesa6)")
-    result = subprocess.run([sys.executable, "-c", RENDER], env=environment, capture_output=True, text=True, check=False)
-    assert result.stdout.strip() == "rendered", result.stderr
+@pytest.mark.parametrize("name", ["PointMazeHard", pytest.param("PointMaze", marks=pytest.mark.slow)])
+def test_rgb_arrays_without_a_display(name):
+    check_pictures(name)
 
 
 def test_picture_of_trajectories(tmp_path, monkeypatch, capsys):

@@ -18,7 +18,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "privacy.md").read_text(encoding="u
 HIDDEN = 12
 SMALL = {"rollout_size": 40, "batch_size": 20, "seed": 3}
 #: without behaviour cloning and few updates, with a trunk narrow enough to tell its sizes apart
-OFFLINE = {"dataset_size": 100, "prior_updates": 4, "prior_average_every": 2, "dice_updates": 2, "prior_width": 16}
+OFFLINE = {"dataset_size": 40, "prior_updates": 4, "prior_average_every": 2, "dice_updates": 2, "prior_width": 16}
 
 Shapes = dict[str, tuple[int, ...]]
 

@@ -71,20 +71,6 @@ def test_a_lost_terminal_lets_the_round_end(tmp_path):
     assert done.read_text() == "129"
 
 
-def test_workers_leave_it_to_the_main_process_to_stop():
-    from sb3_fedguide import Local
-    from sb3_fedguide.engines.processes import Processes
-
-    model = Local("MlpPolicy", "Bandit2D", rollout_size=16, batch_size=8, n_epochs=1, seed=0)
-    with Processes(1) as engine:
-        engine.attach(model)
-        for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
-            os.kill(engine._processes[0].pid, number)
-        assert model.learn(64).num_timesteps == 64
-        processes = list(engine._processes)
-    assert not processes[0].is_alive()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("guarded", [True, False])
 def test_scripts_that_start_workers(guarded, tmp_path):

@@ -22,7 +22,7 @@ from sb3_fedguide.cli.train import main
 from sb3_fedguide.common.checkpoint import checkpoints
 from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.state.array_files import read_arrays
-from tests.test_checkpoint import same
+from tests.comparisons import same
 
 ROOT = Path(__file__).parents[1]
 

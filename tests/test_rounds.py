@@ -17,13 +17,9 @@ from sb3_fedguide.server.participants import draw_participants
 from sb3_fedguide.server.rounds import Rounds, participants
 from sb3_fedguide.server.svrpg import SVRPG
 from sb3_fedguide.settings.schema import hyperparameters
-from tests.loop_transport import NAME
+from tests.loop_transport import NAME, upload
 
 # --- rounds ---------------------------------------------------------------------------------------------------------------
-
-
-def upload(value: float) -> dict[str, np.ndarray]:
-    return {NAME: np.full(3, value, dtype=np.float32), "n_samples": np.array(8, dtype=np.float32)}
 
 
 def test_who_misses_what_others_receive_catches_up_once():

@@ -26,6 +26,7 @@ from sb3_fedguide.offline.datasets import client_datasets
 from sb3_fedguide.offline.minari_io import check_spaces, find_dataset, read_minari
 from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.state.array_files import load_arrays, read_arrays, write_arrays
+from tests.conftest import others_slow
 
 OFFLINE = {"dataset_size": 60, "bc_updates": 2, "dice_updates": 2, "prior_updates": 2, "dice_width": 16, "prior_width": 8}
 SMALL = {"rollout_size": 50, "batch_size": 25, "pretraining": OFFLINE, "policy_kwargs": {"net_arch": [8]}, "normalize": True}
@@ -61,8 +62,12 @@ def assert_same_actions(one, other) -> None:
     )
 
 
-@pytest.mark.parametrize("env", ["Bandit2D", "Reacher"])
-@pytest.mark.parametrize("algo", ALGORITHMS)
+BEFORE_AND_AFTER = [(algo, env) for algo in ALGORITHMS for env in ("Bandit2D", "Reacher")]
+
+
+@pytest.mark.parametrize(
+    ("algo", "env"), others_slow(BEFORE_AND_AFTER, lambda algo, env: env == "Bandit2D" or algo in ("local", "fedguide"))
+)
 def test_actions_after_import_are_those_before_export(algo, env, tmp_path):
     trained = made(algorithm(algo), env=env)
     trained.learn(2 * 50 * trained.n_clients)

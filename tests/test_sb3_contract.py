@@ -13,8 +13,8 @@ from fed_envs import FederatedVecEnv
 from sb3_fedguide import FedAvg, FederatedDDPG, FederatedPPO, FedGuide, FedProx, FedRL, Local
 from sb3_fedguide.common.episodes import EpisodeStatistics
 from sb3_fedguide.settings.ranges import RANGES, check_ranges
-from tests.conftest import PointEnv
-from tests.test_engines import Here
+from tests.environments import PointEnv
+from tests.loop_engine import Here
 
 PPO_SIZES = {"rollout_size": 40, "batch_size": 20, "n_epochs": 1}
 DDPG_SIZES = {"rollout_size": 40, "batch_size": 8, "learning_starts": 20}

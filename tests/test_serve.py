@@ -16,8 +16,7 @@ from sb3_fedguide.deployment.transport import Failure, Message
 from sb3_fedguide.server.averaging import combine
 from sb3_fedguide.server.build import complete_settings
 from sb3_fedguide.state.checkpoint_files import checkpoints
-from tests.loop_transport import CONFIG, NAME, STATED, Client, LoopTransport, replaced, run, timeout
-from tests.test_rounds import upload
+from tests.loop_transport import CONFIG, NAME, STATED, Client, LoopTransport, replaced, run, timeout, upload
 
 
 def expected(n_rounds: int = 5, clients: tuple[int, ...] = (0, 1, 2, 3)) -> np.ndarray:

@@ -132,6 +132,14 @@ def test_experts_are_column_normalised_averages():
     assert 1.0 < strategy.metrics["effective_experts"] < 3.0
 
 
+def test_an_expert_that_nobody_is_routed_to_stays():
+    heads = np.random.default_rng(0).normal(size=(2, 2, 3)).astype(np.float32)
+    strategy = OTMoE(2)
+    strategy.experts, strategy.plan = np.ones((2, 2, 3), dtype=np.float32), np.array([[0.5, 0.0], [0.5, 0.0]])
+    strategy._update_experts(heads)
+    np.testing.assert_allclose(strategy.experts, [heads.mean(axis=0), np.ones((2, 3))], atol=1e-6)
+
+
 def test_equidistant_heads_give_a_permutation_and_clusters_share():
     heads = {k: 10 * np.eye(4, dtype=np.float32)[k].reshape(2, 2) for k in range(4)}
     strategy = OTMoE(4)

@@ -238,10 +238,10 @@ def test_only_statistics_leave_a_client_that_is_alone_otherwise(point_envs, smal
 
 
 @pytest.mark.parametrize("learner", [FedGuide, FedGuideA])
-def test_guided_methods_share_statistics_beside_their_heads(learner, tmp_path):
+def test_guided_methods_share_statistics_beside_their_heads(learner):
     offline = {"dataset_size": 60, "dice_updates": 2}
     settings = {"rollout_size": 40, "batch_size": 20, "seed": 3, "n_epochs": 1, "prior_states": 10}
-    model = learner("MlpPolicy", "Bandit2D", normalize="shared", pretraining=offline, cache_dir=tmp_path, **settings)
+    model = learner("MlpPolicy", "Bandit2D", normalize="shared", pretraining=offline, **settings)
     model.learn(2 * 4 * 40)
     assert model.strategy.rejected == {} and len({row.tobytes() for row in model.normalizer.obs.mean}) == 1
 

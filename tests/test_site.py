@@ -22,7 +22,7 @@ from sb3_fedguide.deployment.serve import ServerConfig, TooFewClients, serve
 from sb3_fedguide.deployment.site import PARAMETERS, Site, make_site
 from sb3_fedguide.deployment.transport import RUN, Message
 from sb3_fedguide.registry import ALGORITHMS, algorithm
-from tests.conftest import assert_same_parameters
+from tests.conftest import assert_same_parameters, others_slow
 from tests.loop_transport import LoopTransport, timeout
 
 CLIENTS, N_ROUNDS = [0, 1, 2], 3
@@ -30,7 +30,7 @@ COMMON = {
     "rollout_size": 32, "batch_size": 16, "n_envs_per_client": 4, "seed": 3, "normalize": True, "bc_weight": 0.3,
     "policy_kwargs": {"net_arch": [16]},
     "pretraining": {
-        "dataset_size": 150, "bc_updates": 4, "dice_updates": 4, "dice_width": 8,
+        "dataset_size": 60, "bc_updates": 4, "dice_updates": 4, "dice_width": 8,
         "prior_updates": 7, "prior_average_every": 3, "prior_width": 8,
     },
 }  # fmt: skip
@@ -89,7 +89,11 @@ def assert_equal(transport: LoopTransport, model: Federation) -> None:
             np.testing.assert_array_equal(site.heads[0], model.heads[client])
 
 
-@pytest.mark.parametrize("algo", [name for name in ALGORITHMS if algorithm(name).is_federated])
+OWN_EXCHANGES = ("fedavg", "fedsvrpgm", "fedrl", "fedguide-a", "fedguide-r")
+FEDERATED = [name for name in ALGORITHMS if algorithm(name).is_federated]
+
+
+@pytest.mark.parametrize("algo", others_slow(FEDERATED, lambda algo: algo in OWN_EXCHANGES))
 def test_three_sites_learn_what_three_clients_learn_in_one_process(algo, tmp_path):
     config, transport = federation(algo, "Bandit2D", tmp_path, fresh=True)
     server = serve(config, transport, tmp_path / "server")

@@ -142,7 +142,7 @@ def test_the_pruner_sees_every_evaluated_round(quick, tmp_path):
     assert not (tmp_path / "out/Bandit2D-fedprox/trial-5/fedprox-seed0.json").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_an_interrupted_trial_goes_on_where_it_was(quick, tmp_path, capfd, number):
     def interrupt() -> None:
         while not list(tmp_path.glob("out/*/trial-*/runs/*/fedprox/*/waiting")):
