@@ -1,61 +1,87 @@
-"""The comparisons of docs/results.md: ``fedguide benchmark`` with its results in ``benchmarks/results``.
+"""The tables of docs/results.md and docs/reproduce.md, from the results in ``benchmarks/results``.
 
-    python benchmarks/compare.py run --env HopperHard --seeds 0 1 2 --processes 2
-    python benchmarks/compare.py table --env HopperHard
     python benchmarks/compare.py page
 
-``run`` takes further flags of the command, such as ``-params``; ``table`` prints Markdown; ``page`` writes every table of
-docs/results.md anew: those that stand under ``<!-- table: FAMILY LABEL -->``.
+writes both pages anew: tables that stand under ``<!-- table: FAMILY LABEL -->``, those of a study's family under
+``<!-- study: NAME FAMILY -->``, and the list of studies under ``<!-- studies -->``. ``fedguide benchmark --study
+benchmarks/studies/NAME.yml`` does a study's runs.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
-import os
 import re
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
-from sb3_fedguide.cli.benchmark import main as benchmark
+from sb3_fedguide.cli.benchmark import Plan, prepare_benchmark
+from sb3_fedguide.cli.benchmark_arguments import parse_benchmark
+from sb3_fedguide.cli.benchmark_costs import total_hours
+from sb3_fedguide.cli.benchmark_results import make_tables
+from sb3_fedguide.cli.benchmark_tables import markdown
+from sb3_fedguide.cli.study_file import read_study
 
-RESULTS = Path(__file__).resolve().parent / "results"
-PAGE = RESULTS.parents[1] / "docs" / "results.md"
+HERE = Path(__file__).resolve().parent
+RESULTS, STUDIES = HERE / "results", HERE / "studies"
+PAGE, LIST = HERE.parent / "docs" / "results.md", HERE.parent / "docs" / "reproduce.md"
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
-    parser.add_argument("command", choices=("run", "table", "page"))
-    parser.add_argument("--env", nargs="+", default=["HopperHard"], help="families")
-    parser.add_argument("--conf", default="tuned", help="configuration")
-    parser.add_argument("--methods", nargs="+", help="by default all")
-    parser.add_argument("--seeds", nargs="+", help="by default 0 1 2, and in tables all that there are")
-    parser.add_argument("--processes", default="2", help="runs at a time")
-    arguments, more = parser.parse_known_args()
-    if arguments.command == "page":
-        PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
-        return 0
-    flags = ["--envs", *arguments.env, "-conf", arguments.conf, "-f", os.path.relpath(RESULTS)]
-    flags += ["--algos", *arguments.methods] if arguments.methods else []
-    if arguments.command == "table":
-        flags += ["--seeds", *arguments.seeds] if arguments.seeds else []
-        return benchmark([*flags, *more, "--table-only", "--markdown"])
-    return benchmark([*flags, "--seeds", *(arguments.seeds or "012"), "--processes", arguments.processes, *more])
+    parser.add_argument("command", choices=("page",))
+    parser.parse_args()
+    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    LIST.write_text(with_studies(LIST.read_text(encoding="utf-8")), encoding="utf-8")
+    return 0
 
 
 def with_tables(text: str) -> str:
     """The page with every marked table as the results give it."""
-    return re.sub(r"<!-- table: (\S+) (\S+) -->\n(?:\n?\|.*\n)*", lambda match: _table(match[1], match[2]), text)
+    text = _replaced(
+        r"table: (?P<family>\S+) (?P<label>\S+)", text,
+        lambda match: _table("--envs", match["family"], "--label", match["label"], "-f", str(RESULTS)),
+    )  # fmt: skip
+    return _replaced(
+        r"study: (?P<name>\S+) (?P<family>\S+)", text,
+        lambda match: _table("--study", str(STUDIES / f"{match['name']}.yml"), "--envs", match["family"]),
+    )  # fmt: skip
 
 
-def _table(family: str, label: str) -> str:
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        benchmark(["--envs", family, "--label", label, "-f", str(RESULTS), "--table-only", "--markdown"])
-    rows = [line for line in printed.getvalue().splitlines() if line.startswith("|")]
-    return "\n".join([f"<!-- table: {family} {label} -->", *rows, ""])
+def with_studies(text: str) -> str:
+    """The page with the list of studies: what each is about, what it costs, and what of it has been done."""
+    return _replaced("studies", text, lambda match: studies())
+
+
+def studies() -> str:
+    """The list of studies as a Markdown table."""
+    lines = ["| study | what | runs, of which done | CPU hours of all |", "|---|---|---|---|"]
+    for path in sorted(STUDIES.glob("*.yml")):
+        study = read_study(path)
+        with tempfile.TemporaryDirectory() as nothing:
+            whole = _plan(path, "-f", nothing)
+        done = len(_plan(path).done)
+        lines.append(f"| `{path.stem}` | {study.title} | {len(whole.runs)}, {done} | {total_hours(whole):.0f} |")
+    return "\n".join(lines)
+
+
+def _plan(path: Path, *flags: str) -> Plan:
+    arguments = parse_benchmark(["--study", str(path), "--dry-run", *flags], "compare.py")
+    return prepare_benchmark(arguments, "compare.py")
+
+
+def _table(*flags: str) -> str:
+    arguments = parse_benchmark([*flags, "--table-only"], "compare.py")
+    plan = prepare_benchmark(arguments, "compare.py")
+    tables = markdown(make_tables(arguments, plan.families, plan.rows))
+    return "\n".join(line for line in tables.splitlines() if line.startswith("|"))
+
+
+def _replaced(marker: str, text: str, table: Callable[[re.Match[str]], str]) -> str:
+    pattern = rf"(?P<marker><!-- {marker} -->)\n(?:\n?\|.*\n)*"
+    return re.sub(pattern, lambda match: f"{match['marker']}\n{table(match)}\n", text)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import fed_envs
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.settings import schema
-from sb3_fedguide.settings.config import CONFIGURATIONS, config_path, parse_params, read_config, resolve
+from sb3_fedguide.settings.config import CONFIGURATIONS, OVERLAYS, config_path, parse_params, read_config, resolve
 from sb3_fedguide.settings.signatures import constructors
 
 BANDIT = fed_envs.load_family("Bandit2D")
@@ -34,7 +34,7 @@ def one_client():
         env.close()
 
 
-@pytest.mark.parametrize("conf", CONFIGURATIONS)
+@pytest.mark.parametrize("conf", CONFIGURATIONS.keys() - OVERLAYS.keys())
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_shipped_configuration_constructs_what_it_says(algo, conf, one_client):
     assert set(read_config(config_path(conf, algo))) <= {"default", *fed_envs.FAMILIES}
@@ -77,6 +77,24 @@ def test_methods_are_compared_under_the_same_settings(name, conf):
         for field, value in values["pretraining"].items():
             if field.startswith(("bc_", "dataset")):
                 assert value == local["pretraining"][field], field
+
+
+@pytest.mark.parametrize("name", ["Bandit2D", "Reacher", "HopperHard", "MetaWorld10"])
+def test_quick_settings_are_the_tuned_ones_made_small(name):
+    family = fed_envs.load_family(name)
+    for algo in ("fedrl", "fedguide", "fedguide-r"):
+        quick, tuned = (resolve(algo, family, conf).values for conf in ("quick", "tuned"))
+        smaller = ("n_rounds", "rollout_size", "pretraining")
+        assert {key: quick[key] for key in quick if key not in smaller} == {
+            key: tuned[key] for key in tuned if key not in smaller
+        }
+        assert quick["n_rounds"] <= tuned["n_rounds"] / 3 and quick["rollout_size"] <= tuned["rollout_size"]
+        assert quick["rollout_size"] % quick["n_envs_per_client"] == 0
+        own, less = quick["pretraining"], ("dataset_size", "bc_updates", "prior_updates", "dice_updates")
+        assert {key: own[key] for key in own if key not in less} == {
+            key: value for key, value in tuned["pretraining"].items() if key not in less
+        }
+        assert own["dataset_size"] >= own["bc_batch_size"] and own["dice_updates"] <= tuned["pretraining"]["dice_updates"] / 10
 
 
 def test_the_papers_settings():

@@ -97,7 +97,7 @@ def check_command(words: list[str]) -> None:
     assert re.search(rf"^  {command} ", USAGE, re.MULTILINE), f"fedguide has no command {command}"
     if command == "train":
         options = parse_train(arguments, "train.py")
-        if options.env in FAMILIES and options.algo in ALGORITHMS and options.conf_file in ("tuned", "paper"):
+        if options.env in FAMILIES and options.algo in ALGORITHMS and options.conf_file in ("tuned", "paper", "quick"):
             resolve(options.algo, load_family(options.env), options.conf_file, overrides=parse_params(options.hyperparams))
     elif command == "benchmark":
         options = benchmark_arguments.parse_benchmark(arguments, "fedguide benchmark")

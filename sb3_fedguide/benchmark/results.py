@@ -47,6 +47,7 @@ class Result:
     :param client_curve: evaluated round to each client's return; empty in files of earlier versions
     :param steps_per_round: environment steps of all clients in a round without tests; ``None`` where the file does not say
     :param round_seconds: of all rounds together: rollout, training and exchange; ``None`` where the file does not say
+    :param delays: the delays that were simulated; ``None`` without
     :param total_bytes: up and down, of all clients together, with what was sent before the first round
     """
 
@@ -76,6 +77,7 @@ class Result:
     steps_per_round: float | None
     round_seconds: float | None
     total_bytes: float
+    delays: str | None = None
 
 
 @dataclass(frozen=True)
@@ -192,6 +194,7 @@ def parse_result(path: Path, content: Mapping[str, Any]) -> Result:
         steps_per_round=_steps_per_round(content) if "timesteps" in content else None,
         round_seconds=_round_seconds(content["seconds"]),
         total_bytes=float(content["bytes_up"]) + float(content["bytes_down"]),
+        delays=content.get("delays"),
     )
 
 

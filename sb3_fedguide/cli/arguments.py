@@ -58,7 +58,7 @@ def train_parser(prog: str) -> OneLineParser:
     flag("-n", "--n-timesteps", type=int, metavar="N", help="environment steps of all clients together, instead of --rounds")
     flag("--rounds", type=int, metavar="N", help="communication rounds; by default those of the configuration")
     flag("--n-envs-per-client", type=int, metavar="N", help="environments per client; by default those of the configuration")
-    flag("-conf", "--conf-file", default="tuned", metavar="CONF", help="hyperparameters: tuned, paper, or a YAML file")
+    flag("-conf", "--conf-file", default="tuned", metavar="CONF", help="hyperparameters: tuned, paper, quick, or a YAML file")
     flag("-params", "--hyperparams", nargs="+", action="extend", default=[], metavar="KEY:VALUE",
          help="hyperparameters to overwrite, e.g. learning_rate:1e-4 policy_kwargs.net_arch:[64,64] "
          "pretraining.dice_updates:1000")  # fmt: skip

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.cli.arguments import parse_train
-from sb3_fedguide.cli.benchmark_arguments import PASSED_ON, SETTINGS, check_methods, parse_benchmark, train_flags
+from sb3_fedguide.cli.benchmark_arguments import OF_RUNS, PASSED_ON, SETTINGS, check_methods, parse_benchmark, train_flags
+from sb3_fedguide.cli.benchmark_results import SEEDS, TableRow, asked_rows, make_tables, require_results, write_tables
 from sb3_fedguide.cli.output import pipe_may_close
 from sb3_fedguide.cli.run import one_message
 from sb3_fedguide.cli.train import (
@@ -19,6 +20,7 @@ from sb3_fedguide.cli.train import (
     check_before_imports,
     find_family,
     prepare,
+    resolved,
 )
 from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.registry import ALGORITHMS
@@ -26,16 +28,12 @@ from sb3_fedguide.settings.packages import import_packages
 
 if TYPE_CHECKING:
     from fed_envs import Family
-    from sb3_fedguide.benchmark.results import Result
     from sb3_fedguide.cli.benchmark_runs import BenchmarkRun, Outcome
-    from sb3_fedguide.cli.benchmark_tables import Tables
+    from sb3_fedguide.cli.study_file import Study
     from sb3_fedguide.settings.config import Config
 
-SEEDS = (0, 1, 2, 3, 4)
 #: Inside the folder of a family's results: what runs need to go on.
 RUNS = "runs"
-#: Inside the folder of all results: what the returns of random actions are.
-RANDOM_ACTIONS = "random-actions"
 
 
 @dataclass(frozen=True)
@@ -43,13 +41,19 @@ class Plan:
     """What is to be done.
 
     :param families: by name, in the order given
+    :param rows: of the tables
     :param runs: those without a result
-    :param n_done: how many have theirs
+    :param configs: the settings of each of them
+    :param done: those that have theirs
+    :param study: that it is of
     """
 
     families: Mapping[str, Family]
-    runs: Sequence[BenchmarkRun]
-    n_done: int
+    rows: Sequence[TableRow]
+    runs: Sequence[BenchmarkRun] = ()
+    configs: Sequence[Config] = ()
+    done: Sequence[BenchmarkRun] = ()
+    study: Study | None = None
 
 
 @pipe_may_close
@@ -69,8 +73,20 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide benchmark") ->
         print(f"{prog}: interrupted before the runs began", file=sys.stderr)
         return EXIT_INTERRUPTED
     try:
+        if arguments.dry_run:
+            from sb3_fedguide.cli.benchmark_costs import print_costs
+
+            print_costs(plan, arguments.eval_freq, arguments.eval_episodes)
+            return 0
         code = _run(arguments, plan) if plan.runs else 0
-        _write(arguments, make_tables(arguments, plan.families, aggregated=code <= EXIT_FAILED))
+        tables = make_tables(arguments, plan.families, plan.rows, aggregated=code <= EXIT_FAILED)
+        if plan.study is not None and len(tables.families) > 1:
+            tables = replace(tables, overview=plan.study.overview)
+        write_tables(arguments, tables)
+        if plan.study is not None and tables.families and code <= EXIT_FAILED:
+            from sb3_fedguide.cli.study import write_study
+
+            write_study(plan, arguments, tables)
     except (ValueError, OSError) as error:
         print(f"{prog}: error: {one_message(error)}", file=sys.stderr)
         return EXIT_FAILED
@@ -86,9 +102,14 @@ def prepare_benchmark(arguments: argparse.Namespace, prog: str) -> Plan:
     :raises ValueError: for anything that a user can put right
     """
     import_packages(arguments.gym_packages)
-    check_methods(arguments)
-    plan = make_plan(arguments, prog)
-    if arguments.engine == "ray" and plan.runs:
+    if arguments.study is not None:
+        from sb3_fedguide.cli.study import plan_study
+
+        plan = plan_study(arguments, prog)
+    else:
+        check_methods(arguments)
+        plan = make_plan(arguments, prog)
+    if arguments.engine == "ray" and plan.runs and not arguments.dry_run:
         from sb3_fedguide.cli.benchmark_ray import connect
 
         connect(arguments.address)
@@ -96,15 +117,15 @@ def prepare_benchmark(arguments: argparse.Namespace, prog: str) -> Plan:
 
 
 def make_plan(arguments: argparse.Namespace, prog: str) -> Plan:
-    """Check every run that is to be done; nothing is created.
+    """Check every run that is to be done; nothing is created. With ``--dry-run`` no algorithm is constructed for that.
 
     :raises ValueError: for anything that a user can put right
     """
-    methods, flags = arguments.algos or list(ALGORITHMS), train_flags(arguments, SETTINGS + PASSED_ON)
-    sources, families = _sources(arguments), find_families(arguments, prog)
+    methods, flags = arguments.algos or list(ALGORITHMS), train_flags(arguments, SETTINGS + PASSED_ON + OF_RUNS)
+    sources, families, rows = _sources(arguments), find_families(arguments, prog), asked_rows(arguments)
     if arguments.table_only:
-        _require_results(arguments, families)
-        return Plan(families, (), 0)
+        require_results(arguments.folder, families, rows)
+        return Plan(families, rows)
     combinations = []
     for family, source in zip(families.values(), sources, strict=True):
         for method in methods:
@@ -112,16 +133,24 @@ def make_plan(arguments: argparse.Namespace, prog: str) -> Plan:
             parsed = parse_train([*own, "-f", arguments.folder, "--seed", str(max(arguments.seeds or SEEDS))], prog)
             check_before_imports(parsed)
             combinations.append((method, family, own, parsed))
-    checked = [(method, family, own, prepare(parsed, family, "").config) for method, family, own, parsed in combinations]
-    runs, n_done = [], 0
+    runs: list[BenchmarkRun] = []
+    configs: list[Config] = []
+    done: list[BenchmarkRun] = []
+    checked = [(method, family, own, parsed, resolved(parsed, family)) for method, family, own, parsed in combinations]
+    missing = []
     for seed in arguments.seeds or SEEDS:
-        for method, family, own, config in checked:
+        for number, (method, family, own, _, config) in enumerate(checked):
             run = _benchmark_run(arguments, method, family, seed, own)
-            n_done += run.result.is_file()
-            _check_earlier(run, family, config, arguments.eval_episodes)
-            if not run.result.is_file():
+            _check_earlier(run, family, config, arguments)
+            if run.result.is_file():
+                done.append(run)
+            else:
                 runs.append(run)
-    return Plan(families, runs, n_done)
+                configs.append(config)
+                missing.append(number)
+    for number in () if arguments.dry_run else sorted(set(missing)):
+        prepare(checked[number][3], checked[number][1], "")  # whether the settings fit the environments
+    return Plan(families, rows, runs, configs, done)
 
 
 def _sources(arguments: argparse.Namespace) -> list[tuple[str, str]]:
@@ -163,20 +192,28 @@ def _benchmark_run(
     )
 
 
-def _check_earlier(run: BenchmarkRun, family: Family, config: Config, n_episodes: int) -> None:
+def _check_earlier(run: BenchmarkRun, family: Family, config: Config, arguments: argparse.Namespace) -> None:
     """:raises ValueError: if the run has been done, or begun, with other settings than those that are asked for"""
     from sb3_fedguide.benchmark.results import read_result
     from sb3_fedguide.cli.benchmark_runs import interrupted_folder
+    from sb3_fedguide.cli.delays import read_delays
     from sb3_fedguide.settings.config import read_yaml
 
-    now = {**config.values, "clients": family.content_hash}
+    now = {
+        **config.values,
+        "clients": family.content_hash,
+        "--delays": arguments.delays and str(read_delays(arguments.delays)),
+    }
     if run.result.is_file():
         result, where = read_result(run.result), run.result
         before: dict[str, Any] = {"n_rounds": result.n_rounds, **(result.config or {}), "clients": result.metadata_hash}
-        before["--eval-episodes"], now["--eval-episodes"] = result.n_episodes, n_episodes
+        before["--delays"] = result.delays
+        before["--eval-episodes"], now["--eval-episodes"] = result.n_episodes, arguments.eval_episodes
     elif (folder := interrupted_folder(run.log_folder, run.method)) is not None:
         where = folder
         before = {**read_yaml(folder / "config.yml"), "clients": (folder / "metadata.sha256").read_text().strip()}
+        if (folder / "args.yml").is_file():
+            before["--delays"] = read_yaml(folder / "args.yml").get("delays")
     else:
         return
     if changed := differences(before, now):
@@ -197,19 +234,6 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str =
     return sorted(found)
 
 
-def _require_results(arguments: argparse.Namespace, families: Mapping[str, Family]) -> None:
-    for name, measures in benchmark_results(arguments, families).items():
-        if not measures:
-            raise ValueError(no_results(arguments.folder, name))
-
-
-def no_results(folder: str, family: str) -> str:
-    """The message for a family without results, with the folders of results that there are."""
-    there = sorted(path.parent.name for path in Path(folder).glob("*/*-seed*.json"))
-    known = f"; there are {', '.join(dict.fromkeys(there))}" if there else ""
-    return f"{folder} has no results of {family} with these methods and seeds{known}"
-
-
 def _run(arguments: argparse.Namespace, plan: Plan) -> int:
     """Do the runs and report each."""
     from sb3_fedguide.cli.benchmark_runs import forget, interrupted_folder, run_here
@@ -219,7 +243,8 @@ def _run(arguments: argparse.Namespace, plan: Plan) -> int:
     total, n_finished = len(plan.runs), 0
     failed: list[BenchmarkRun] = []
     resumed = sum(interrupted_folder(run.log_folder, run.method) is not None for run in plan.runs)
-    _say(f"{total} runs to do, {resumed} of them begun before; {plan.n_done} have their result; writing to {arguments.folder}")
+    before = f"{resumed} of them begun before; {len(plan.done)} have their result"
+    _say(f"{total} runs to do, {before}; writing to {arguments.folder}")
 
     def done(run: BenchmarkRun, outcome: Outcome) -> None:
         nonlocal n_finished
@@ -262,92 +287,3 @@ def _run(arguments: argparse.Namespace, plan: Plan) -> int:
 
 def _say(message: str) -> None:
     print(message, file=sys.stderr, flush=True)
-
-
-def benchmark_results(arguments: argparse.Namespace, families: Iterable[str]) -> dict[str, dict[str, list[Result]]]:
-    """Family to method to its results."""
-    from sb3_fedguide.benchmark.results import read_results
-
-    seeds = arguments.seeds or (None if arguments.table_only else SEEDS)
-    methods = arguments.algos or list(ALGORITHMS)
-    return {name: read_results(Path(arguments.folder), name, arguments.label, methods, seeds) for name in families}
-
-
-def make_tables(arguments: argparse.Namespace, families: Mapping[str, Family], aggregated: bool = True) -> Tables:
-    """Tables of all results that there are.
-
-    :param aggregated: whether several families are aggregated
-    :raises ValueError: for a damaged result file
-    """
-    from sb3_fedguide.benchmark.results import best_known, measure
-    from sb3_fedguide.cli.benchmark_tables import Tables
-
-    found = {name: results for name, results in benchmark_results(arguments, families).items() if results}
-    rows = {}
-    for name, results in found.items():
-        baseline = results.get(arguments.baseline)
-        baseline = baseline if len(results) > 1 else None
-        best = best_known(run for runs in results.values() for run in runs)
-        rows[f"{name}-{arguments.label}"] = [measure(runs, arguments.at_rounds, baseline, best) for runs in results.values()]
-    if len(found) < 2 or not aggregated:
-        return Tables(rows, (), ())
-    complete = [method for method in next(iter(found.values())) if all(method in results for results in found.values())]
-    if arguments.baseline not in complete:
-        note = f"no aggregate: it needs results of the baseline, {arguments.baseline}, on every family"
-        return Tables(rows, (), (note,))
-    from sb3_fedguide.benchmark.aggregate import aggregate
-
-    finals = {name: {method: [run.final for run in results[method]] for method in complete} for name, results in found.items()}
-    means = {name: sum(values[arguments.baseline]) / len(values[arguments.baseline]) for name, values in finals.items()}
-    levels = {name: (random_level(Path(arguments.folder), families[name]), means[name]) for name in found}
-    if too_low := [f"{name} ({high:.4g}, random actions {low:.4g})" for name, (low, high) in levels.items() if not low < high]:
-        note = f"no aggregate: the baseline, {arguments.baseline}, is no better than random actions on {', '.join(too_low)}"
-        return Tables(rows, (), (note,))
-    aggregates = [aggregate(method, {name: finals[name][method] for name in found}, levels) for method in complete]
-    scale = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, (low, high) in levels.items())
-    notes = [f"Scores are 0 for random actions and 1 for the mean of {arguments.baseline}: {scale}."]
-    if partial := sorted({method for results in found.values() for method in results} - set(complete)):
-        notes.append(f"Without {', '.join(partial)}, of which some families have no run.")
-    return Tables(rows, aggregates, notes)
-
-
-def random_level(folder: Path, family: Family) -> float:
-    """What random actions return, measured once and kept with the results."""
-    from sb3_fedguide.benchmark.aggregate import random_actions
-    from sb3_fedguide.cli.run_folder import write_json
-
-    path = folder / RANDOM_ACTIONS / f"{family.name}.json"
-    try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if kept["metadata_hash"] == family.content_hash:
-            return float(kept["average"])
-    except (OSError, ValueError, KeyError, TypeError):
-        pass  # not measured yet, or of other clients
-    evaluation = random_actions(family)
-    content = {
-        "env": family.name,
-        "metadata_hash": family.content_hash,
-        "average": evaluation.average,
-        "client_returns": evaluation.client_returns.tolist(),
-        "n_episodes": evaluation.returns.shape[1],
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, content)
-    return evaluation.average
-
-
-def _write(arguments: argparse.Namespace, tables: Tables) -> None:
-    from sb3_fedguide.cli.benchmark_tables import as_csv, as_json, markdown, print_tables
-    from sb3_fedguide.cli.run_folder import write_text
-
-    if not tables.families:
-        return
-    formats = {"markdown": markdown, "json": as_json, "csv": as_csv}
-    asked = {name: getattr(arguments, name) for name in formats if getattr(arguments, name) is not None}
-    for name, file in asked.items():
-        if file == "-":
-            print(formats[name](tables), end="")
-        else:
-            write_text(Path(file), formats[name](tables))
-    if "-" not in asked.values():
-        print_tables(tables)

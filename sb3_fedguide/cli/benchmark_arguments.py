@@ -17,7 +17,14 @@ from sb3_fedguide.settings.names import check_names
 SETTINGS = ("dataset", "rounds", "n_envs_per_client", "conf_file", "hyperparams")
 #: Other flags of the training command.
 PASSED_ON = ("gym_packages", "cache_dir", "eval_freq", "eval_episodes", "save_freq", "device")
+#: Those that only a benchmark takes, and that a run which goes on has in its own settings.
+OF_RUNS = ("delays", "eval_average")
+#: With ``--study``, what the study's file says instead.
+OF_STUDY = (*SETTINGS, "delays", "metadata", "label", "eval_freq", "eval_episodes", "at_rounds", "baseline")
 ENGINES = ("local", "ray")
+FOLDER = "runs/benchmark"
+#: Of tables in files.
+FORMATS = ("markdown", "latex", "json", "csv")
 
 
 def benchmark_parser(prog: str) -> OneLineParser:
@@ -26,19 +33,21 @@ def benchmark_parser(prog: str) -> OneLineParser:
         prog=prog,
         allow_abbrev=False,
         description="Train methods on families with seeds, one result file per run, and print tables of the results. Runs "
-        "that have their result are not repeated, those that were interrupted go on.",
+        "that have their result are not repeated, those that were interrupted go on. A study is all of this in a file.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     flag = parser.add_argument
+    flag("--study", metavar="FILE", help="YAML file of a study: methods, families, seeds and settings; --algos, --envs and "
+         "--seeds then choose a part of it, and tables and figures are written to DIR/studies/NAME")  # fmt: skip
     flag("--algos", nargs="+", metavar="ALGO", help=f"methods; by default all: {', '.join(ALGORITHMS)}")
     flag("--envs", nargs="+", default=[], metavar="FAMILY", help="families of client environments, such as HopperHard")
     flag("--metadata", nargs="+", default=[], metavar="FILE", help="metadata files of families of your own")
     flag("--seeds", nargs="+", type=int, metavar="N", help="by default 0 1 2 3 4, and with --table-only all that there are")
     for action in train_parser(prog)._actions:
-        if action.dest in SETTINGS + PASSED_ON:
+        if action.dest in SETTINGS + PASSED_ON + OF_RUNS:
             parser._add_action(action)
-    flag("-f", "--folder", default="runs/benchmark", metavar="DIR", help="results are written to "
-         "DIR/FAMILY-LABEL/ALGO-seedN.json, and runs keep what they need to go on in DIR/FAMILY-LABEL/runs")  # fmt: skip
+    flag("-f", "--folder", metavar="DIR", help=f"results are written to DIR/FAMILY-LABEL/ALGO-seedN.json, and runs keep "
+         f"what they need to go on in DIR/FAMILY-LABEL/runs; by default {FOLDER}, or that of the study")  # fmt: skip
     flag("--label", help="name of the results; by default the configuration's")
     flag("--keep-runs", action="store_true", help="keep the folders of finished runs: models, TensorBoard events")
     flag(
@@ -48,10 +57,11 @@ def benchmark_parser(prog: str) -> OneLineParser:
     flag("--address", "--ray-address", metavar="HOST:PORT", help="Ray cluster; by default "
          "$RAY_ADDRESS, the one that runs here, or a new one")  # fmt: skip
     flag("--table-only", action="store_true", help="do no runs, print what there is")
+    flag("--dry-run", action="store_true", help="do nothing; list the runs that are missing and estimate their CPU hours")
     flag("--at-rounds", nargs="*", type=int, default=[25, 50], metavar="N", help="rounds of the curve that tables show")
     flag("--baseline", default="local", metavar="ALGO", help="method whose mean return scores 1 where several families are "
          "aggregated")  # fmt: skip
-    for name in ("markdown", "json", "csv"):
+    for name in FORMATS:
         flag(f"--{name}", nargs="?", const="-", metavar="FILE", help=f"write the tables as {name} to FILE, or to the terminal")
     return parser
 
@@ -61,9 +71,13 @@ def parse_benchmark(argv: Sequence[str] | None, prog: str) -> argparse.Namespace
     parser = benchmark_parser(prog)
     arguments = parser.parse_strictly(argv)
     try:
+        if arguments.study is not None:
+            _check_study(arguments, parser)
         _check(arguments)
     except ValueError as error:
         parser.error(str(error))
+    if arguments.folder is None and arguments.study is None:
+        arguments.folder = FOLDER
     arguments.label = arguments.label if arguments.label is not None else Path(arguments.conf_file).stem
     if not re.fullmatch(r"[\w.+=-]+", arguments.label):
         parser.error(f"--label {arguments.label!r} is to be part of a folder's name: letters, digits and . _ + = - only")
@@ -71,7 +85,7 @@ def parse_benchmark(argv: Sequence[str] | None, prog: str) -> argparse.Namespace
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    if not arguments.envs and not arguments.metadata:
+    if not arguments.envs and not arguments.metadata and arguments.study is None:
         raise ValueError("give the families with --envs FAMILY ..., or --metadata FILE ...")
     for flag, values in (("--algos", arguments.algos), ("--envs", arguments.envs)):
         check_once(flag, values or ())
@@ -80,10 +94,18 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--at-rounds counts from 1, but got {wrong[0]}")
     if arguments.address is not None and arguments.engine != "ray":
         raise ValueError("--address is that of a Ray cluster; give --engine ray as well")
-    files = [file for file in (arguments.markdown, arguments.json, arguments.csv) if file not in (None, "-")]
-    for file in files:
+    if arguments.dry_run and arguments.table_only:
+        raise ValueError("--dry-run and --table-only contradict each other; give one of them")
+    for file in [file for name in FORMATS if (file := getattr(arguments, name)) not in (None, "-")]:
         if not Path(file).absolute().parent.is_dir() or Path(file).is_dir():
             raise ValueError(f"the tables cannot be written to {file}: {_reason(Path(file))}")
+
+
+def _check_study(arguments: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """:raises ValueError: for a flag whose meaning the study's file decides"""
+    for action in parser._actions:
+        if action.dest in OF_STUDY and getattr(arguments, action.dest) != action.default:
+            raise ValueError(f"{action.option_strings[0]} is said in the file of a study; leave it out, or --study")
 
 
 def check_once(flag: str, values: Sequence[Any]) -> None:
@@ -121,6 +143,8 @@ def train_flags(arguments: argparse.Namespace, names: Sequence[str]) -> list[str
     flags: list[str] = []
     for action in train_parser("")._actions:
         value = getattr(arguments, action.dest, None) if action.dest in names else None
-        if value is not None and value != []:
+        if value is True:
+            flags.append(action.option_strings[-1])
+        elif value is not None and value is not False and value != []:
             flags += [action.option_strings[-1], *(map(str, value) if isinstance(value, list) else [str(value)])]
     return flags

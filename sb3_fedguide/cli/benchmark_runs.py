@@ -41,6 +41,7 @@ class BenchmarkRun:
     :param flags: of the training command, where it begins
     :param resume_flags: of the training command, where it goes on
     :param folder: where the commands run, if the machine has it
+    :param title: what the method is called; by default its name
     """
 
     method: str
@@ -51,10 +52,11 @@ class BenchmarkRun:
     flags: tuple[str, ...]
     resume_flags: tuple[str, ...]
     folder: Path
+    title: str = ""
 
     @property
     def name(self) -> str:
-        return f"{self.method} on {self.family}, seed {self.seed}"
+        return f"{self.title or self.method} on {self.family}, seed {self.seed}"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Tables of a benchmark: on the terminal, as Markdown, JSON and CSV."""
+"""Tables of a benchmark: on the terminal, as Markdown, LaTeX, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -25,11 +26,13 @@ class Tables:
     :param families: name of the results, such as ``HopperHard-tuned``, to one row per method
     :param aggregates: methods over all families; empty for a single one
     :param notes: what is to be said about them
+    :param overview: columns that get a table of their own, with a row per family and a column per method
     """
 
     families: Mapping[str, Sequence[Measures]]
     aggregates: Sequence[Aggregate]
     notes: Sequence[str]
+    overview: Sequence[str] = ()
 
 
 Row = dict[str, str]
@@ -43,8 +46,15 @@ LEGEND = (
 
 def rows_of(measures: Sequence[Measures]) -> list[Row]:
     """The cells of one family's table by column; columns that no method has a value for are left out."""
-    rounds = dict.fromkeys(round for row in measures for round in row.curve)
-    columns: dict[str, Callable[[Measures], str | None]] = {
+    return _table(columns_of(dict.fromkeys(round for row in measures for round in row.curve)), measures)
+
+
+def columns_of(rounds: Iterable[int] = ()) -> dict[str, Callable[[Measures], str | None]]:
+    """Name of a column to what it shows of a method.
+
+    :param rounds: of the curve
+    """
+    return {
         "method": lambda row: row.method,
         "seeds": lambda row: str(len(row.seeds)),
         "F": lambda row: f"{row.F:.4g} ± {row.F_std:.3g}" if len(row.seeds) > 1 else f"{row.F:.4g}",
@@ -62,7 +72,17 @@ def rows_of(measures: Sequence[Measures]) -> list[Row]:
         "s per round": lambda row: f"{row.seconds_per_round:.3g}",
         "paper F": lambda row: _number(row.paper_F, "g"),
     }
-    return _table(columns, measures)
+
+
+def overview_rows(tables: Tables, column: str) -> list[Row]:
+    """One measure of all families: a row per family, a column per method."""
+    methods = dict.fromkeys(row.method for measures in tables.families.values() for row in measures)
+    cell = columns_of()[column]
+    rows = []
+    for family, measures in tables.families.items():
+        cells = {row.method: cell(row) for row in measures}
+        rows.append({"family": family, **{method: cells.get(method) or "-" for method in methods}})
+    return rows
 
 
 def aggregate_rows(aggregates: Sequence[Aggregate]) -> list[Row]:
@@ -108,21 +128,34 @@ def _number(value: float | None, form: str) -> str | None:
 
 
 def print_tables(tables: Tables) -> None:
-    """On the terminal; what is wider than it is continued below, the methods named again."""
+    """On the terminal."""
+    for title, rows in _titled(tables):
+        print_rows(title, rows)
+    print_notes(LEGEND, *tables.notes)
+
+
+def print_rows(title: str, rows: Sequence[Row], *notes: str) -> None:
+    """On the terminal; what is wider than it is continued below, the first column repeated."""
     from rich.console import Console
     from rich.table import Table
 
     console = Console(width=None if Console().is_terminal else 160)
-    for title, rows in _titled(tables):
-        for part, columns in enumerate(fitting(rows, console.width)):
-            table = Table(title="" if part else title, title_justify="left")
-            for name in columns:
-                table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
-            for row in rows:
-                table.add_row(*(row[name] for name in columns))
-            console.print(table)
-    for note in (LEGEND, *tables.notes):
-        console.print(note, highlight=False, soft_wrap=True)
+    for part, columns in enumerate(fitting(rows, console.width)):
+        table = Table(title="" if part else title, title_justify="left")
+        for name in columns:
+            table.add_column(name, justify="left" if name == next(iter(rows[0])) else "right", no_wrap=True)
+        for row in rows:
+            table.add_row(*(row[name] for name in columns))
+        console.print(table)
+    print_notes(*notes)
+
+
+def print_notes(*notes: str) -> None:
+    """On the terminal, each on lines of its own."""
+    from rich.console import Console
+
+    for note in notes:
+        Console().print(note, highlight=False, soft_wrap=True)
 
 
 def fitting(rows: Sequence[Row], width: int) -> list[list[str]]:
@@ -141,7 +174,8 @@ def fitting(rows: Sequence[Row], width: int) -> list[list[str]]:
 
 
 def _titled(tables: Tables) -> list[tuple[str, list[Row]]]:
-    titled = [(name, rows_of(measures)) for name, measures in tables.families.items()]
+    titled = [(f"{column} by family", overview_rows(tables, column)) for column in tables.overview if tables.families]
+    titled += [(name, rows_of(measures)) for name, measures in tables.families.items()]
     if tables.aggregates:
         titled.append(("All families: normalised scores", aggregate_rows(tables.aggregates)))
     return titled
@@ -154,6 +188,26 @@ def markdown(tables: Tables) -> str:
         lines += [f"## {title}", "", f"| {' | '.join(rows[0])} |", "|---" * len(rows[0]) + "|"]
         lines += [*(f"| {' | '.join(row.values())} |" for row in rows), ""]
     return "\n".join([*lines, *(f"* {note}" for note in tables.notes)]).rstrip() + "\n"
+
+
+def latex(tables: Tables) -> str:
+    """A ``table`` environment each, with the rules of booktabs; the notes as comments."""
+    lines = ["% needs \\usepackage{booktabs}"]
+    for title, rows in _titled(tables):
+        lines += ["\\begin{table}", "\\centering", f"\\caption{{{_escaped(title)}}}"]
+        lines += [f"\\begin{{tabular}}{{l{'r' * (len(rows[0]) - 1)}}}", "\\toprule", _latex_row(rows[0]), "\\midrule"]
+        lines += [*(_latex_row(row.values()) for row in rows), "\\bottomrule", "\\end{tabular}", "\\end{table}", ""]
+    return "\n".join([*lines, *(f"% {note}" for note in tables.notes)]).rstrip() + "\n"
+
+
+def _latex_row(cells: Iterable[str]) -> str:
+    return " & ".join(map(_escaped, cells)) + " \\\\"
+
+
+def _escaped(text: str) -> str:
+    special = {"\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}", "±": "$\\pm$"}
+    escaped = "".join(special.get(letter, f"\\{letter}" if letter in "&%$#_{}" else letter) for letter in text)
+    return re.sub(r"(?<![\w)])-(?=[\d.])", "$-$", escaped)
 
 
 def as_json(tables: Tables) -> str:
@@ -188,3 +242,7 @@ def as_csv(tables: Tables) -> str:
     writer.writeheader()
     writer.writerows(records)
     return file.getvalue()
+
+
+#: By the flag of the command that asks for them.
+WRITERS: dict[str, Callable[[Tables], str]] = {"markdown": markdown, "latex": latex, "json": as_json, "csv": as_csv}

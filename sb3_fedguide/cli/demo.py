@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Train both, print the measures, write the picture and the numbers."""
     parser = OneLineParser(prog="fedguide demo", description=__doc__)
     parser.add_argument("-f", "--folder", default="runs/demo", metavar="DIR", help="where the picture goes")
-    parser.add_argument("-conf", "--conf-file", default="tuned", metavar="CONF", help="tuned, paper, or a YAML file")
+    parser.add_argument("-conf", "--conf-file", default="tuned", metavar="CONF", help="tuned, paper, quick, or a YAML file")
     parser.add_argument("--rounds", type=int, metavar="N", help="communication rounds, by default those of the configuration")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-P", "--progress", action="store_true", help="progress bars")

@@ -30,6 +30,8 @@ SHARED = ("algos", "envs", "metadata", "seeds", "folder", "baseline", "gym_packa
 #: Those that choose results of a benchmark, so that they say nothing about run folders.
 OF_BENCHMARK = ("algos", "metadata", "seeds", "label")
 FIGURES = ("curves", "bars", "clients", "aggregate", "speedup")
+#: Those that are drawn from the logs of runs, in their folders.
+OF_LOGS = ("lemma2", "theorem3")
 #: Flags of the learning curves, and what they are by default.
 OF_CURVES = {"x": "rounds", "of": "average", "band": "range"}
 
@@ -78,7 +80,13 @@ def _parse(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
             parser._add_action(action)
     flag("--label", nargs="+", metavar="LABEL", help="names of the results; by default tuned; with several, methods are "
          "called by their name and label")  # fmt: skip
-    flag("--figures", nargs="+", metavar="FIGURE", help=f"{', '.join(FIGURES)}; by default all that the data allow")
+    flag(
+        "--figures",
+        nargs="+",
+        metavar="FIGURE",
+        help=f"{', '.join(FIGURES + OF_LOGS)}; by default all that the data allow, "
+        f"without {' and '.join(OF_LOGS)}, which take folders of runs",
+    )
     flag("-x", choices=("rounds", "steps", "seconds", "bytes"), help="what learning curves are drawn over; by default rounds")
     flag("--of", choices=("average", "worst", "clients"), help="what learning curves show: the clients' average (default), "
          "the worst client, or each client in a panel of its own")  # fmt: skip
@@ -89,7 +97,7 @@ def _parse(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
         if action.dest in ("seeds", "folder", "baseline"):
             action.help = {
                 "seeds": "by default all that there are",
-                "folder": "results are in DIR/FAMILY-LABEL/ALGO-seedN.json",
+                "folder": "results are in DIR/FAMILY-LABEL/ALGO-seedN.json; by default runs/benchmark",
                 "baseline": "method to compare with: its mean return scores 1, and is what counts for the speed-up",
             }[action.dest]
     return parser.parse_strictly(argv)
@@ -107,7 +115,7 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ValueError("give folders of runs or --envs, not both")
     if arguments.runs and (given := [name for name in OF_BENCHMARK if getattr(arguments, name)]):
         raise ValueError(f"--{given[0]} chooses results of a benchmark (--envs); with folders of runs, leave it out")
-    check_names(arguments.figures or (), FIGURES, "figure")
+    check_names(arguments.figures or (), FIGURES + OF_LOGS, "figure")
     given = [name for name in OF_CURVES if getattr(arguments, name) is not None]
     if given and arguments.figures and "curves" not in arguments.figures:
         raise ValueError(f"-{'' if given[0] == 'x' else '-'}{given[0]} is for learning curves; add curves to --figures")
@@ -132,12 +140,13 @@ def _read(arguments: argparse.Namespace, prog: str) -> tuple[Comparison, Callabl
     labels = arguments.label or ["tuned"]
     parsed = [parse_benchmark(_benchmark_flags(arguments, label), prog) for label in labels]
     check_methods(parsed[0])
-    from sb3_fedguide.cli.benchmark import find_families, random_level
+    from sb3_fedguide.cli.benchmark import find_families
+    from sb3_fedguide.cli.benchmark_results import random_level
     from sb3_fedguide.cli.plot_runs import read_benchmark
 
     families: Mapping[str, Family] = find_families(parsed[0], prog)
     comparison = read_benchmark(parsed[0], families, labels)
-    return comparison, lambda family: random_level(Path(arguments.folder), families[family])
+    return comparison, lambda family: random_level(Path(parsed[0].folder), families[family])
 
 
 def _random_of(folder: Path) -> float:
@@ -155,6 +164,29 @@ def _benchmark_flags(arguments: argparse.Namespace, label: str) -> list[str]:
         if value:
             flags += [f"--{name.replace('_', '-')}", *(map(str, value) if isinstance(value, list) else [str(value)])]
     return flags
+
+
+def drawable(
+    comparison: Comparison, families: Mapping[str, Family], benchmark: argparse.Namespace, figures: Sequence[str] | None = None
+) -> tuple[Drawn, list[str]]:
+    """Every figure that runs of a benchmark allow, and why the others are left out.
+
+    :param benchmark: its flags, of which the folder and the baseline count
+    :param figures: those to try; by default those of results
+    """
+    from sb3_fedguide.cli.benchmark_results import random_level
+
+    options = argparse.Namespace(baseline=benchmark.baseline, **OF_CURVES)
+    drawn: Drawn = []
+    left_out: list[str] = []
+    for figure in figures or FIGURES:
+        try:
+            drawn += _draw(
+                figure, options, comparison, lambda name: random_level(Path(benchmark.folder), families[name]), left_out
+            )
+        except ValueError as error:
+            left_out.append(f"left out {figure}: {error}")
+    return drawn, left_out
 
 
 def _draw_all(
@@ -191,6 +223,13 @@ def _draw(
     """:param notes: takes what is to be said about the figure"""
     from sb3_fedguide.benchmark.figures import bars, clients, curves
 
+    if figure in OF_LOGS:
+        from sb3_fedguide.benchmark.figures.theory import draw_lemma2, draw_theorem3
+        from sb3_fedguide.cli.plot_logs import averages, read_logs
+
+        if figure == "lemma2":
+            return [(figure, draw_lemma2(read_logs(comparison)))]
+        return [(figure, draw_theorem3(read_logs(averages(comparison))))]
     if figure == "curves":
         name = f"curves-{arguments.of}-{arguments.x}"
         if arguments.of != "clients":

@@ -14,7 +14,7 @@ import numpy as np
 
 from sb3_fedguide.benchmark.figures.runs import Comparison, Run, bytes_at, from_result, seconds_at
 from sb3_fedguide.benchmark.results import Result, check_comparable, parse_result
-from sb3_fedguide.cli.benchmark import benchmark_results, no_results
+from sb3_fedguide.cli.benchmark_results import benchmark_results, no_results
 from sb3_fedguide.cli.run_folder import EVALUATIONS
 from sb3_fedguide.registry import ALGORITHMS
 

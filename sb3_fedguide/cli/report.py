@@ -49,7 +49,7 @@ def summarize(
         },
     }
     if model.delays is not None:
-        result["simulated_seconds"] = model.delays.seconds
+        result |= {"delays": str(model.delays.settings), "simulated_seconds": model.delays.seconds}
     for policy in evaluated:
         result[policy] = {
             "client_returns": [float(value) for value in evaluated[policy].client_returns],

@@ -239,16 +239,23 @@ def settings_entry(arguments: argparse.Namespace) -> str | None:
     return None if arguments.env is None else arguments.env.removeprefix(ID_PREFIX).removesuffix(ID_SUFFIX)
 
 
-def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
-    """Resolve the hyperparameters and construct the algorithm; nothing is written yet.
+def resolved(arguments: argparse.Namespace, family: Family) -> Config:
+    """The hyperparameters that the flags ask for.
 
     :raises ValueError: for anything that a user can put right
     """
     from sb3_fedguide.settings.config import resolve
 
-    given = overrides(arguments)
-    entry = settings_entry(arguments)
-    config = resolve(arguments.algo, family, arguments.conf_file, entry, given, arguments.n_timesteps)
+    given, entry = overrides(arguments), settings_entry(arguments)
+    return resolve(arguments.algo, family, arguments.conf_file, entry, given, arguments.n_timesteps)
+
+
+def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
+    """Resolve the hyperparameters and construct the algorithm; nothing is written yet.
+
+    :raises ValueError: for anything that a user can put right
+    """
+    config = resolved(arguments, family)
     if config.values["pretraining"]["dataset"] is not None:
         _check_dataset(config.values["pretraining"]["dataset"], family)
     model = make_model(arguments, config, family)

@@ -69,11 +69,13 @@ def baseline_figures(returns: np.ndarray, online: np.ndarray, dice: np.ndarray, 
 
     :param returns: Monte Carlo returns G, ``(n_clients, n_rows)``, like the three baselines
     """
+    best = optimal_blend(returns, online, dice)
     return {
-        "beta_optimal": optimal_blend(returns, online, dice),
+        "beta_optimal": best,
         "residual_correlation": residual_correlations(returns, online, dice),
         "advantage_variance_online": advantage_variances(returns, online),
         "advantage_variance_blend": advantage_variances(returns, blend),
+        "advantage_variance_optimal": advantage_variances(returns, best[:, None] * online + (1 - best[:, None]) * dice),
         "explained_variance_online": explained_variances(online, returns),
         "explained_variance_dice": explained_variances(dice, returns),
         "explained_variance_blend": explained_variances(blend, returns),

@@ -66,7 +66,7 @@ _DICE: Layout = {
     "DICE": {
         "weight of the online critic": ["dice/beta", "dice/beta_optimal"],
         "explained variance": [r"dice/explained_variance_(online|dice|blend)"],
-        "variance of the advantage (Lemma 2)": [r"dice/advantage_variance_(online|blend)"],
+        "variance of the advantage (Lemma 2)": [r"dice/advantage_variance_(online|blend|optimal)"],
         "residual correlation (Lemma 2)": ["dice/residual_correlation"],
     }
 }

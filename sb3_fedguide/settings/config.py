@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
 #: Name of a configuration to the folder inside ``zoo_configs`` that holds it.
-CONFIGURATIONS = {"tuned": ".", "paper": "paper"}
+CONFIGURATIONS = {"tuned": ".", "paper": "paper", "quick": "."}
+#: The file of ``zoo_configs`` whose entries go over every method's own, by configuration.
+OVERLAYS = {"quick": "quick.yml"}
 
 #: Families whose settings a user's own family on the same backbone starts from.
 BACKBONE_FAMILIES = {
@@ -111,7 +113,7 @@ def resolve(
 
     :param algo: command-line name of an algorithm
     :param family: whom to train
-    :param conf_file: ``"tuned"``, ``"paper"``, or the path of a YAML file
+    :param conf_file: ``"tuned"``, ``"paper"``, ``"quick"`` (tuned, but small and short), or the path of a YAML file
     :param entry: name of the family whose settings to take; by default the family's own, or that of its backbone
     :param overrides: from ``-params`` and flags; nested ones by dotted keys
     :param n_timesteps: steps of all clients together instead of ``n_rounds``
@@ -119,15 +121,10 @@ def resolve(
     """
     check_names([algo], ALGORITHMS, "algorithm")
     path = config_path(conf_file, algo)
-    content = read_config(path)
-    applied = next(
-        (name for name in (entry or family.name, BACKBONE_FAMILIES.get(family.backbone, "")) if name in content), DEFAULT
-    )
-    merged: dict[str, Any] = {}
-    for name in dict.fromkeys((DEFAULT, applied)):
-        if name in content:
-            _check_keys(content[name], algo, f"{path}, entry {name!r}")
-            merged = _merge(merged, content[name])
+    names = (entry or family.name, BACKBONE_FAMILIES.get(family.backbone, ""))
+    applied, merged = _entries(path, names, algo)
+    if conf_file in OVERLAYS:
+        merged = _merge(merged, _entries(_config_folder() / OVERLAYS[conf_file], names, algo)[1])
     merged = _merge(merged, _nest(overrides or {}))
     try:
         values = complete(merged, algo)
@@ -138,6 +135,18 @@ def resolve(
             raise ValueError(f"n_timesteps={n_timesteps} must be at least 1; it counts the steps of all clients together")
         values["n_rounds"] = rounds_of(values, family.n_clients, n_timesteps)
     return Config(algo, applied, values)
+
+
+def _entries(path: Path, names: Sequence[str], algo: str) -> tuple[str, dict[str, Any]]:
+    """The first of the entries ``names`` that a file has, and what it says over the file's ``default``."""
+    content = read_config(path)
+    applied = next((name for name in names if name in content), DEFAULT)
+    merged: dict[str, Any] = {}
+    for name in dict.fromkeys((DEFAULT, applied)):
+        if name in content:
+            _check_keys(content[name], algo, f"{path}, entry {name!r}")
+            merged = _merge(merged, content[name])
+    return applied, merged
 
 
 def rounds_of(values: Mapping[str, Any], n_clients: int, n_timesteps: int) -> int:
@@ -176,21 +185,23 @@ def config_path(conf_file: str, algo: str) -> Path:
     :raises ValueError: if there is none
     """
     own = ALGORITHMS[algo].settings
-    if conf_file == "tuned" and own is not None:
+    if own is not None and CONFIGURATIONS.get(conf_file) == ".":
         return own
     if conf_file in CONFIGURATIONS:
-        import zoo_configs
-
-        folder = Path(next(iter(zoo_configs.__path__))) / CONFIGURATIONS[conf_file]
+        folder = _config_folder() / CONFIGURATIONS[conf_file]
         path = folder / f"{algo}.yml"
         return path if path.is_file() else _inherited_path(folder, algo)
     path = Path(conf_file)
     if not path.is_file():
         hint = "" if path.suffix else nearest(conf_file, CONFIGURATIONS)
-        raise ValueError(
-            f"no configuration {conf_file!r}.{hint} Give {' or '.join(CONFIGURATIONS)}, or the path of a YAML file"
-        )
+        raise ValueError(f"no configuration {conf_file!r}.{hint} Give {', '.join(CONFIGURATIONS)}, or the path of a YAML file")
     return path
+
+
+def _config_folder() -> Path:
+    import zoo_configs
+
+    return Path(next(iter(zoo_configs.__path__)))
 
 
 def _inherited_path(folder: Path, algo: str) -> Path:

@@ -29,7 +29,8 @@ NOT_HYPERPARAMETERS = {
 SCHEDULE = re.compile(r"^(?P<kind>lin|until)_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)?)$")
 
 
-def hyperparameters(algorithm: type) -> dict[str, tuple[Any, Any]]:
+@functools.cache
+def hyperparameters(algorithm: type) -> Mapping[str, tuple[Any, Any]]:
     """Name to (type, default) of every hyperparameter of an algorithm, its own first, then those of its bases."""
     return {
         name: (parameter.annotation, parameter.default)

@@ -149,7 +149,9 @@ def require_finished(comparison: Comparison) -> dict[str, dict[str, list[Result]
 
 
 def base(results: Mapping[str, Sequence[Result]], baseline: str) -> str:
-    """The name under which the baseline's results are; empty where there are none."""
+    """The name under which the baseline's results are, by that name or its method's; empty where there are none."""
+    if baseline in results:
+        return baseline
     return next((name for name, group in results.items() if group[0].method == baseline), "")
 
 

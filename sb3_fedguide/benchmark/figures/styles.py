@@ -59,7 +59,7 @@ STYLES = {
 
 
 def style(method: str, variant: int = 0) -> Style:
-    """How ``method`` is drawn; with ``variant`` 1, 2, ... the same colour with another line.
+    """How ``method`` is drawn; with ``variant`` 1 and 2 the same colour with another line, from 3 on another colour as well.
 
     A user's own algorithm gets a dotted line, and its colour and marker by its place among the registered ones.
     """
@@ -72,4 +72,8 @@ def style(method: str, variant: int = 0) -> Style:
         found = Style(_OWN_COLORS[place % n], ":", _OWN_MARKERS[(place + place // n) % n], "xx")
     if not variant:
         return found
-    return Style(found.color, _VARIANT_LINES[1 + (variant - 1) % 2], found.marker, found.hatch + "..", hollow=True)
+    line = _VARIANT_LINES[1 + (variant - 1) % 2]
+    if variant > 2:
+        place = (variant - 3) % len(_OWN_COLORS)
+        return Style(_OWN_COLORS[place], line, _OWN_MARKERS[place], found.hatch + "..", hollow=True)
+    return Style(found.color, line, found.marker, found.hatch + "..", hollow=True)

@@ -1,0 +1,108 @@
+"""What a run will cost, in seconds of one core that does nothing else: estimates from measured rounds, not promises.
+
+The figures are those of ``docs/performance.md`` (networks 64-64, eight clients, a quiet machine). A busy machine takes two or
+three times as long; so does another processor.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sb3_fedguide.registry import algorithm
+from sb3_fedguide.server.participants import n_participants
+from sb3_fedguide.settings.pretraining import Piece, PretrainingConfig
+
+#: Microseconds of one client's environment step with its policy, by backbone; and steps of an evaluation episode, at most.
+STEPS: dict[str, tuple[float, int]] = {
+    "Bandit2D": (40, 1), "Reacher-v5": (25, 50), "Hopper-v5": (61, 700), "Walker2d-v5": (90, 1000),
+    "HalfCheetah-v5": (32, 1000), "MetaWorld-v3": (410, 500), "PointMaze-v3": (33, 300),
+}  # fmt: skip
+#: For backbones that nobody has measured.
+OTHER_STEPS = (60, 1000)
+#: How much longer a step takes for each width of 64 more.
+STEP_WIDTH = 0.2
+#: Microseconds of a row of the rollout in an epoch, for layers of 64; the cost grows with their width.
+ROW, ROW_WIDTH = 4.9, 64
+#: Microseconds of a client's gradient step of DDPG, 64-64.
+DDPG_STEP = 360.0
+#: With how much more training a method's own terms come; and of a whole round, with each estimator of the prior's term.
+TRAINING = {"fedprox": 1.3, "fedkl": 1.4, "fedsvrpgm": 1.9}
+PRIOR_ROUND = {"sample": 1.2, "snis": 1.75}
+#: Milliseconds of an update of eight clients of behaviour cloning, trunk and DICE with so many rows in a batch.
+OFFLINE_UPDATE: dict[Piece, tuple[float, int]] = {"bc": (6.5, 512), "prior": (10.8, 128), "dice": (33.0, 128)}
+#: Seconds for the data of eight clients, and for the heads on the trunk, of 20,000 rows each.
+OFFLINE_ROWS = {"bc": 12.0, "prior": 11.0, "dice": 0.0}
+ROWS, CLIENTS = 20_000, 8
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of one run, in seconds.
+
+    :param rounds: rollouts, training and tests
+    :param evaluation: of the deployed policies
+    :param offline: piece of the offline stage to its seconds; runs with the same piece share it
+    """
+
+    rounds: float
+    evaluation: float
+    offline: Mapping[str, float]
+
+
+def estimate(
+    algo: str, values: Mapping[str, Any], backbone: str, n_clients: int, seed: int, eval_freq: int = 5, n_episodes: int = 10
+) -> Cost:
+    """The cost of a run.
+
+    :param values: its complete hyperparameters
+    :param backbone: of its family
+    :param seed: the offline stage is kept for each seed
+    """
+    n_rounds, present = values["n_rounds"], n_participants(values["client_fraction"], n_clients)
+    step, length = STEPS.get(backbone, OTHER_STEPS)
+    width = _width(values["policy_kwargs"])
+    step *= 1 + STEP_WIDTH * max(0.0, width / ROW_WIDTH - 1)
+    rows = values["rollout_size"] * present
+    if "n_epochs" in values:
+        training = ROW * width / ROW_WIDTH * values["n_epochs"] * TRAINING.get(algo, 1.0)
+    else:
+        training = DDPG_STEP * width / ROW_WIDTH
+    round = rows * (step * (1 + values.get("screening", 0.0)) + training) / 1e6
+    guided = (
+        min(values.get("prior_horizon", 0), n_rounds) / n_rounds * (PRIOR_ROUND.get(values.get("prior_loss", ""), 1.0) - 1)
+    )
+    evaluations = sum(number % eval_freq == 0 or number > n_rounds - 20 for number in range(1, n_rounds + 1))
+    return Cost(
+        rounds=n_rounds * round * (1 + guided),
+        evaluation=evaluations * n_episodes * n_clients * length * step / 1e6,
+        offline=_offline(algo, values, backbone, n_clients, seed),
+    )
+
+
+def _width(policy_kwargs: Mapping[str, Any]) -> int:
+    layers = policy_kwargs["net_arch"] or [ROW_WIDTH]
+    layers = [*layers["pi"], *next(layers[name] for name in layers if name != "pi")] if isinstance(layers, dict) else layers
+    return max(layers, default=ROW_WIDTH)
+
+
+def _offline(algo: str, values: Mapping[str, Any], backbone: str, n_clients: int, seed: int) -> dict[str, float]:
+    config = PretrainingConfig(**values["pretraining"])
+    gaussian = config.prior == "gaussian" or (config.prior == "auto" and backbone == "Bandit2D")
+    pieces: list[Piece] = ["bc"] if values["bc_weight"] > 0 else []
+    pieces += ["prior"] if getattr(algorithm(algo), "uses_prior", False) and not gaussian else []
+    pieces += ["dice"] if getattr(algorithm(algo), "uses_dice", False) else []
+    n_rows = config.dataset_size or (1_000 if backbone == "Bandit2D" else ROWS)
+    found = {}
+    for piece in pieces:
+        milliseconds, batch = OFFLINE_UPDATE[piece]
+        n_updates, share = config.n_updates(piece, n_rows), getattr(config, f"{piece}_batch_size") / batch
+        seconds = milliseconds * n_updates * max(share, math.sqrt(share)) / 1e3  # small batches gain less
+        own = {name: value for name, value in config.model_dump(mode="json").items() if name.startswith((piece, "dataset"))}
+        network = values["policy_kwargs"]["net_arch"] if piece == "bc" else None
+        key = json.dumps([piece, seed, own, network], sort_keys=True)
+        found[key] = (seconds + OFFLINE_ROWS[piece] * n_rows / ROWS) * n_clients / CLIENTS
+    return found

@@ -1,0 +1,164 @@
+"""Results of a benchmark as rows of tables, and the tables."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sb3_fedguide.registry import ALGORITHMS
+
+if TYPE_CHECKING:
+    from fed_envs import Family
+    from sb3_fedguide.benchmark.results import Result
+    from sb3_fedguide.cli.benchmark_tables import Tables
+
+SEEDS = (0, 1, 2, 3, 4)
+#: Inside the folder of all results: what the returns of random actions are.
+RANDOM_ACTIONS = "random-actions"
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """A row of a family's table: a method under a label.
+
+    :param name: what the table calls it
+    :param seeds: those that count; ``None`` for all that there are
+    :param families: those that have this row; ``None`` for all
+    """
+
+    name: str
+    method: str
+    label: str
+    seeds: Sequence[int] | None
+    families: Sequence[str] | None = None
+
+
+def asked_rows(arguments: argparse.Namespace) -> list[TableRow]:
+    """A row for each method that the flags ask for."""
+    seeds = arguments.seeds or (None if arguments.table_only else SEEDS)
+    return [TableRow(method, method, arguments.label, seeds) for method in arguments.algos or ALGORITHMS]
+
+
+def require_results(folder: str, families: Iterable[str], rows: Sequence[TableRow]) -> None:
+    """:raises ValueError: for a family without a result"""
+    for name, results in results_of_rows(folder, families, rows).items():
+        if not results:
+            raise ValueError(no_results(folder, name))
+
+
+def no_results(folder: str, family: str) -> str:
+    """The message for a family without results, with the folders of results that there are."""
+    there = sorted(path.parent.name for path in Path(folder).glob("*/*-seed*.json"))
+    known = f"; there are {', '.join(dict.fromkeys(there))}" if there else ""
+    return f"{folder} has no results of {family} with these methods and seeds{known}"
+
+
+def benchmark_results(arguments: argparse.Namespace, families: Iterable[str]) -> dict[str, dict[str, list[Result]]]:
+    """Family to method to its results."""
+    return results_of_rows(arguments.folder, families, asked_rows(arguments))
+
+
+def results_of_rows(folder: str, families: Iterable[str], rows: Sequence[TableRow]) -> dict[str, dict[str, list[Result]]]:
+    """Family to the name of a row to its results, for the rows that have some.
+
+    :raises ValueError: for a damaged file, and for results that cannot stand in one table
+    """
+    from sb3_fedguide.benchmark.results import check_comparable, read_results
+
+    found: dict[str, dict[str, list[Result]]] = {}
+    for name in families:
+        found[name] = {}
+        for row in rows:
+            if row.families is None or name in row.families:
+                for results in read_results(Path(folder), name, row.label, [row.method], row.seeds).values():
+                    found[name][row.name] = results
+        check_comparable([result for results in found[name].values() for result in results])
+    return found
+
+
+def make_tables(
+    arguments: argparse.Namespace, families: Mapping[str, Family], rows: Sequence[TableRow], aggregated: bool = True
+) -> Tables:
+    """Tables of all results that there are.
+
+    :param aggregated: whether several families are aggregated
+    :raises ValueError: for a damaged result file
+    """
+    from sb3_fedguide.benchmark.results import best_known, measure
+    from sb3_fedguide.cli.benchmark_tables import Tables
+
+    found = {name: results for name, results in results_of_rows(arguments.folder, families, rows).items() if results}
+    tables = {}
+    for name, results in found.items():
+        baseline = results.get(arguments.baseline)
+        baseline = baseline if len(results) > 1 else None
+        best = best_known(run for runs in results.values() for run in runs)
+        tables[f"{name}-{arguments.label}" if arguments.study is None else name] = [
+            replace(measure(runs, arguments.at_rounds, baseline, best), method=row) for row, runs in results.items()
+        ]
+    if len(found) < 2 or not aggregated:
+        return Tables(tables, (), ())
+    complete = [method for method in next(iter(found.values())) if all(method in results for results in found.values())]
+    if arguments.baseline not in complete:
+        note = f"no aggregate: it needs results of the baseline, {arguments.baseline}, on every family"
+        return Tables(tables, (), (note,))
+    from sb3_fedguide.benchmark.aggregate import aggregate
+
+    finals = {name: {method: [run.final for run in results[method]] for method in complete} for name, results in found.items()}
+    means = {name: sum(values[arguments.baseline]) / len(values[arguments.baseline]) for name, values in finals.items()}
+    levels = {name: (random_level(Path(arguments.folder), families[name]), means[name]) for name in found}
+    if too_low := [f"{name} ({high:.4g}, random actions {low:.4g})" for name, (low, high) in levels.items() if not low < high]:
+        note = f"no aggregate: the baseline, {arguments.baseline}, is no better than random actions on {', '.join(too_low)}"
+        return Tables(tables, (), (note,))
+    aggregates = [aggregate(method, {name: finals[name][method] for name in found}, levels) for method in complete]
+    scale = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, (low, high) in levels.items())
+    notes = [f"Scores are 0 for random actions and 1 for the mean of {arguments.baseline}: {scale}."]
+    if partial := sorted({method for results in found.values() for method in results} - set(complete)):
+        notes.append(f"Without {', '.join(partial)}, of which some families have no run.")
+    return Tables(tables, aggregates, notes)
+
+
+def random_level(folder: Path, family: Family) -> float:
+    """What random actions return, measured once and kept with the results."""
+    from sb3_fedguide.benchmark.aggregate import random_actions
+    from sb3_fedguide.cli.run_folder import write_json
+
+    path = folder / RANDOM_ACTIONS / f"{family.name}.json"
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        if kept["metadata_hash"] == family.content_hash:
+            return float(kept["average"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # not measured yet, or of other clients
+    evaluation = random_actions(family)
+    content = {
+        "env": family.name,
+        "metadata_hash": family.content_hash,
+        "average": evaluation.average,
+        "client_returns": evaluation.client_returns.tolist(),
+        "n_episodes": evaluation.returns.shape[1],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, content)
+    return evaluation.average
+
+
+def write_tables(arguments: argparse.Namespace, tables: Tables) -> None:
+    """To the files that the flags name; on the terminal, unless one of them is to be there."""
+    from sb3_fedguide.cli.benchmark_tables import WRITERS, print_tables
+    from sb3_fedguide.cli.run_folder import write_text
+
+    if not tables.families:
+        return
+    asked = {name: getattr(arguments, name) for name in WRITERS if getattr(arguments, name) is not None}
+    for name, file in asked.items():
+        if file == "-":
+            print(WRITERS[name](tables), end="")
+        else:
+            write_text(Path(file), WRITERS[name](tables))
+    if "-" not in asked.values():
+        print_tables(tables)

@@ -1,0 +1,205 @@
+"""The file of a study: which methods, in which settings, on which families, with which seeds. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import pydantic
+
+from sb3_fedguide.cli.benchmark_arguments import FOLDER, check_once
+from sb3_fedguide.cli.benchmark_results import SEEDS, TableRow
+from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.settings.config import CONFIGURATIONS, NESTED, read_yaml
+from sb3_fedguide.settings.names import check_names
+from sb3_fedguide.settings.schema import check_model
+
+Count = Annotated[int, pydantic.Field(ge=1, lt=2**31)]
+Seed = Annotated[int, pydantic.Field(ge=0, lt=2**31)]
+
+
+class MethodEntry(pydantic.BaseModel):
+    """A row of the study's tables: a method in one setting. What is not said is as for the whole study.
+
+    :param algo: name of the algorithm; by default the row's own name
+    :param conf: configuration: its name, or a YAML file beside the study's
+    :param label: of its results; by default the configuration's name
+    :param params: hyperparameters, over those of the whole study
+    :param families: those that have this row
+    :param delays: as ``--delays`` of the training command
+    """
+
+    model_config = pydantic.ConfigDict(extra="forbid", strict=True)
+
+    algo: str | None = None
+    conf: str | None = None
+    label: str | None = None
+    params: dict[str, Any] = {}
+    seeds: list[Seed] | None = None
+    families: list[str] | None = None
+    delays: str | None = None
+
+
+class StudyFile(pydantic.BaseModel):
+    """The file.
+
+    :param title: what it is about
+    :param methods: name of a row to its :class:`MethodEntry`, or nothing
+    :param families: of client environments, by name
+    :param metadata: files of families of one's own, beside the study's file
+    :param rounds: of every run; by default those of the configuration
+    :param eval_average: also evaluate the average of the clients' policies (Theorem 3), and keep the runs' folders
+    :param baseline: row that scores 1, and that differences and the speed-up refer to
+    :param at_rounds: rounds of the curve that tables show
+    :param overview: columns that get a table of their own: a row per family, a column per method
+    :param folder: of the results, beside the study's file
+    :param processes: runs at a time
+    """
+
+    model_config = pydantic.ConfigDict(extra="forbid", strict=True)
+
+    title: str = ""
+    methods: dict[str, dict[str, Any] | None] = {}
+    families: list[str] = []
+    metadata: list[str] = []
+    seeds: list[Seed] = list(SEEDS)
+    rounds: Count | None = None
+    conf: str = "tuned"
+    label: str | None = None
+    params: dict[str, Any] = {}
+    delays: str | None = None
+    eval_freq: Count | None = None
+    eval_episodes: Count | None = None
+    eval_average: bool = False
+    baseline: str = "local"
+    at_rounds: list[Count] = [25, 50]
+    overview: list[str] = ["F"]
+    folder: str | None = None
+    processes: Count | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method in one setting.
+
+    :param flags: of ``fedguide benchmark`` for its runs, without families and seeds
+    """
+
+    name: str
+    algo: str
+    label: str
+    seeds: Sequence[int]
+    families: Sequence[str] | None
+    flags: Sequence[str]
+
+    @property
+    def in_tables(self) -> TableRow:
+        return TableRow(self.name, self.algo, self.label, self.seeds, self.families)
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study, checked as far as that goes without its families.
+
+    :param name: of its file
+    :param metadata: absolute paths
+    :param folder: of the results
+    """
+
+    name: str
+    title: str
+    rows: Sequence[Row]
+    families: Sequence[str]
+    metadata: Sequence[str]
+    baseline: str
+    at_rounds: Sequence[int]
+    overview: Sequence[str]
+    eval_freq: int | None
+    eval_episodes: int | None
+    eval_average: bool
+    folder: str
+    processes: int | None
+
+
+def read_study(path: Path) -> Study:
+    """:raises ValueError: one line, for a file that cannot be read or says something unknown or wrong"""
+    if not path.is_file():
+        raise ValueError(f"--study: there is no file {path}")
+    try:
+        return _study(path, read_yaml(path))
+    except ValueError as error:
+        message = str(error)
+        raise ValueError(message if str(path) in message else f"{path}: {message}") from None
+
+
+def _study(path: Path, content: Any) -> Study:
+    from sb3_fedguide.cli.benchmark_tables import columns_of
+
+    example = "a study says at least its methods and families, e.g. {methods: {local: {}}, families: [HopperHard]}"
+    if not isinstance(content, Mapping):
+        raise ValueError(example)
+    file = check_model("the study", StudyFile, content, {})
+    assert isinstance(file, StudyFile)
+    if not file.methods:
+        raise ValueError(example)
+    if not file.families and not file.metadata:
+        raise ValueError("families is missing: give names such as [HopperHard], or metadata files")
+    rows = [_row(path, file, name, entry or {}) for name, entry in file.methods.items()]
+    check_names([file.baseline], [row.name for row in rows] + ["local"], "row as baseline:")
+    check_names(file.overview, columns_of(), "column in overview:")
+    return Study(
+        name=path.stem,
+        title=file.title,
+        rows=rows,
+        families=file.families,
+        metadata=[str(path.parent / name) for name in file.metadata],
+        baseline=file.baseline,
+        at_rounds=file.at_rounds,
+        overview=file.overview,
+        eval_freq=file.eval_freq,
+        eval_episodes=file.eval_episodes,
+        eval_average=file.eval_average,
+        folder=FOLDER if file.folder is None else str(path.parent / file.folder),
+        processes=file.processes,
+    )
+
+
+def _row(path: Path, file: StudyFile, name: str, entry: Mapping[str, Any]) -> Row:
+    own = check_model(f"method {name!r}", MethodEntry, entry, {})
+    assert isinstance(own, MethodEntry)
+    if "|" in name or "\n" in name:
+        raise ValueError(f"method {name!r} is to be a row of a table; give it a name without | and line breaks")
+    if own.algo is None and (first := name.split()[0]) in ALGORITHMS and first != name:
+        raise ValueError(f"method {name!r} does not say its algorithm; give it algo: {first}")
+    algo = own.algo or name
+    check_names([algo], ALGORITHMS, f"algorithm of method {name!r}:" if own.algo else "algorithm")
+    conf = own.conf or file.conf
+    conf = conf if conf in CONFIGURATIONS or not Path(conf).suffix else str(path.parent / conf)
+    label = own.label or file.label or Path(conf).stem
+    flags = ["-conf", conf, "--label", label]
+    params = {**dict(_dotted(file.params)), **dict(_dotted(own.params))}
+    flags += ["-params", *(f"{key}:{_scalar(value)}" for key, value in params.items())] if params else []
+    given = {"rounds": file.rounds, "delays": own.delays or file.delays}
+    for flag, value in given.items():
+        flags += [] if value is None else [f"--{flag}", str(value)]
+    seeds = file.seeds if own.seeds is None else own.seeds
+    check_once(f"seeds of method {name!r}", seeds)
+    return Row(name, algo, label, seeds, own.families, flags + ["--eval-average"] * file.eval_average)
+
+
+def _dotted(params: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for name, value in params.items():
+        if name in NESTED and isinstance(value, Mapping):
+            yield from ((f"{name}.{key}", part) for key, part in value.items())
+        else:
+            yield name, value
+
+
+def _scalar(value: Any) -> str:
+    """As YAML that is read as the same value again."""
+    plain = isinstance(value, str) and re.fullmatch(r"[a-z]+_[\d.]+", value)
+    return value if plain else json.dumps(value)

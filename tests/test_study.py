@@ -1,0 +1,258 @@
+"""``fedguide benchmark --study``: a file says what is compared; its rows are benchmarks with common tables and figures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+import fed_envs
+from sb3_fedguide.benchmark.costs import estimate
+from sb3_fedguide.benchmark.figures import layout
+from sb3_fedguide.benchmark.figures.styles import style
+from sb3_fedguide.benchmark.results import measure, read_result
+from sb3_fedguide.cli import benchmark, benchmark_runs, plot
+from sb3_fedguide.cli.benchmark import main, prepare_benchmark
+from sb3_fedguide.cli.benchmark_arguments import parse_benchmark
+from sb3_fedguide.cli.benchmark_costs import cost_rows, costs_of, offline_seconds, total_hours
+from sb3_fedguide.cli.benchmark_runs import Outcome
+from sb3_fedguide.cli.benchmark_tables import Tables, latex, rows_of
+from sb3_fedguide.cli.delays import read_delays
+from sb3_fedguide.cli.plot import FIGURES
+from sb3_fedguide.cli.study_file import read_study
+from sb3_fedguide.settings.config import resolve
+from tests.result_files import result, two_families
+
+STUDIES = sorted((Path(__file__).parents[1] / "benchmarks" / "studies").glob("*.yml"))
+STUDY = {
+    "families": ["Bandit2D"], "seeds": [0, 1], "rounds": 3, "eval_episodes": 3, "folder": "results", "at_rounds": [2],
+    "methods": {
+        "local": None,
+        "fedavg": {"seeds": [0]},
+        "fedavg (slow)": {"algo": "fedavg", "label": "slow", "params": {"n_epochs": 1, "policy_kwargs": {"net_arch": [8, 8]}}},
+    },
+}  # fmt: skip
+
+
+def write(folder: Path, **changes) -> str:
+    path = folder / "mine.yml"
+    path.write_text(yaml.safe_dump({**STUDY, **changes}, sort_keys=False))
+    return str(path)
+
+
+def plan_of(path: str, *flags: str):
+    return prepare_benchmark(
+        parse_benchmark(["--study", path, "--dry-run", *flags], "fedguide benchmark"), "fedguide benchmark"
+    )
+
+
+def done(folder: Path, algo: str, seed: int, level: float, label: str = "tuned", **more) -> None:
+    config = {"n_rounds": 3, "n_epochs": 1 if label == "slow" else 4}
+    result(folder, algo, seed, level, label, n_rounds=3, config=config, **more)
+
+
+def test_rows_are_runs_of_their_own_settings_in_the_order_of_seeds(tmp_path):
+    done(tmp_path / "results", "local", 0, 1.0)
+    plan = plan_of(write(tmp_path))
+    assert [(run.name, run.result.parent.name) for run in plan.runs] == [
+        ("fedavg on Bandit2D, seed 0", "Bandit2D-tuned"),
+        ("fedavg (slow) on Bandit2D, seed 0", "Bandit2D-slow"),
+        ("local on Bandit2D, seed 1", "Bandit2D-tuned"),
+        ("fedavg (slow) on Bandit2D, seed 1", "Bandit2D-slow"),
+    ]
+    assert [run.name for run in plan.done] == ["local on Bandit2D, seed 0"]
+    assert [config.values["n_epochs"] for config in plan.configs] == [4, 1, 4, 1]
+    assert [config.values["policy_kwargs"]["net_arch"] for config in plan.configs] == [None, [8, 8], None, [8, 8]]
+    assert {config.n_rounds for config in plan.configs} == {3}
+    assert all("-f" in run.flags and str(tmp_path) in str(run.result) for run in plan.runs)
+
+
+def test_delays_and_the_evaluation_of_averages_reach_the_runs(tmp_path):
+    methods = {"local": None, "local, late": {"algo": "local", "label": "late", "delays": "deadline:median=60,deadline=90"}}
+    path = write(tmp_path, methods=methods, eval_average=True, seeds=[0])
+    plain, late = plan_of(path).runs
+    assert "--eval-average" in plain.flags and "--delays" not in plain.flags
+    assert late.flags[late.flags.index("--delays") + 1] == "deadline:median=60,deadline=90"
+    assert "--picture-freq" not in plain.flags  # folders are kept, and pictures with them
+    done(tmp_path / "results", "local", 0, 1.0, "late", delays=str(read_delays("deadline:median=60,deadline=90")))
+    assert [run.title for run in plan_of(path).done] == ["local, late"]
+    done(tmp_path / "results", "local", 0, 1.0, "late", delays=str(read_delays("deadline:median=60,deadline=91")))
+    with pytest.raises(ValueError, match=r"method 'local, late': .* other settings: --delays .*deadline=91.0"):
+        plan_of(path)
+
+
+def test_a_part_of_a_study_can_be_chosen(tmp_path):
+    path = write(tmp_path)
+    assert [run.name for run in plan_of(path, "--algos", "fedavg", "--seeds", "0").runs] == [
+        "fedavg on Bandit2D, seed 0", "fedavg (slow) on Bandit2D, seed 0",
+    ]  # fmt: skip
+    assert [run.title for run in plan_of(path, "--algos", "fedavg (slow)").runs] == ["fedavg (slow)"] * 2
+    elsewhere = plan_of(path, "-f", str(tmp_path / "elsewhere"))
+    assert all(tmp_path / "elsewhere" in run.result.parents for run in elsewhere.runs)
+
+
+@pytest.mark.parametrize("figures", [("bars",), pytest.param(FIGURES, marks=pytest.mark.slow)], ids=["bars", "all"])
+def test_what_a_study_ends_with(figures, tmp_path, monkeypatch, capfd):
+    """Runs that are there stand in for those that the study does; tables and figures lie beside the results."""
+    monkeypatch.setattr(plot, "FIGURES", figures)
+    monkeypatch.setattr(layout, "DPI", 20)
+    monkeypatch.setattr(layout, "FORMATS", ("png",))
+    results = tmp_path / "results"
+    results.mkdir()
+    file = two_families(results)
+    own = fed_envs.load_family(file).content_hash
+    for family, family_hash in {"Bandit2D": fed_envs.load_family("Bandit2D").content_hash, "Mine": own}.items():
+        for seed in (0, 1):
+            done(results, "fedavg", seed, 0.5, "slow", env=family, metadata_hash=family_hash)
+    started = []
+
+    def run_here(runs, n_processes, signals, report, say):
+        for run in runs:
+            started.append(run.name)
+            report(run, Outcome(problem="no electricity"))
+
+    monkeypatch.setattr(benchmark_runs, "run_here", run_here)
+    monkeypatch.setattr(benchmark, "prepare", lambda *_: None)  # no network is needed
+    path = write(tmp_path, metadata=["results/mine.json"], seeds=[0, 1, 2], overview=["F", "W"])
+    assert main(["--study", path, "--markdown"]) == 1
+    captured = capfd.readouterr()
+    assert started == [f"{name} on {family}, seed 2" for name in ("local", "fedavg (slow)") for family in ("Bandit2D", "Mine")]
+    assert "## F by family" in captured.out and "| Bandit2D | 3.15 ± 0.15 | 2.4 | 1.5 ± 0 |" in captured.out
+    folder = results / "studies" / "mine"
+    assert (folder / "tables.md").read_text() == captured.out
+    rows = json.loads((folder / "tables.json").read_text())["families"]["Bandit2D"]
+    assert [(row["method"], row["seeds"]) for row in rows] == [("local", [0, 1]), ("fedavg", [0]), ("fedavg (slow)", [0, 1])]
+    assert "\\toprule" in (folder / "tables.tex").read_text()
+    assert (folder / "tables.csv").read_text().startswith("results,method")
+    drawn = {"curves": "curves-average-rounds.png", "bars": "bars.png", "clients": "clients-Mine.png",
+             "aggregate": "aggregate.png", "speedup": "speedup.png"}  # fmt: skip
+    for figure in figures:
+        assert figure not in drawn or (folder / drawn[figure]).stat().st_size > 1000
+
+
+def test_a_dry_run_lists_and_writes_nothing(tmp_path, capfd):
+    path = write(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["--study", path, "--dry-run"]) == 0
+    captured = capfd.readouterr()
+    assert "fedavg (slow)" in captured.out and "offline stage, once" in captured.out and captured.err == ""
+    assert sorted(tmp_path.rglob("*")) == before
+    assert main(["--envs", "Bandit2D", "--algos", "local", "--dry-run", "-f", str(tmp_path / "none")]) == 0
+    assert "missing" in capfd.readouterr().out and sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_offline_stage_counts_once_for_a_seed_and_setting(tmp_path):
+    plan = plan_of(write(tmp_path, methods={"local": None, "fedavg": None, "fedguide": None, "fedguide-p": None}))
+    costs = costs_of(plan)
+    cloning = [key for _, key in offline_seconds(plan, costs) if json.loads(key)[0] == "bc"]
+    value = [key for _, key in offline_seconds(plan, costs) if json.loads(key)[0] == "dice"]
+    assert len(cloning) == 2 and len(value) == 2  # a seed each, whatever the number of methods
+    once = sum(offline_seconds(plan, costs).values())
+    assert total_hours(plan) == pytest.approx((once + sum(cost.rounds + cost.evaluation for cost in costs)) / 3600)
+    assert cost_rows(plan, costs)[-1]["missing"] == "8"
+
+
+def test_an_estimate_is_near_what_was_measured():
+    """HopperHard with four environments per client: 2.65 s a round on a quiet core (docs/performance.md), 254 s offline."""
+    family = fed_envs.load_family("HopperHard")
+    cost = {
+        algo: estimate(algo, resolve(algo, family).values, family.backbone, 8, 0) for algo in ("local", "fedavg", "fedguide")
+    }
+    assert cost["local"].rounds / 100 == pytest.approx(2.65, rel=0.05)
+    assert cost["fedavg"].rounds > 1.15 * cost["local"].rounds  # eight epochs, not four
+    assert sum(cost["fedguide"].offline.values()) == pytest.approx(254, rel=0.05)
+    assert set(cost["local"].offline) < set(cost["fedguide"].offline)
+    paper = resolve("fedguide", family, "paper").values
+    assert sum(estimate("fedguide", paper, family.backbone, 8, 0).offline.values()) > 3600
+
+
+WRONG = {
+    "metods: {local: }": "unknown key in the study: 'metods'. Did you mean 'methods'?",
+    "methods: {}": "a study says at least its methods and families",
+    "methods: {fedgiude: }\nfamilies: [Bandit2D]": "unknown algorithm 'fedgiude'. Did you mean 'fedguide'?",
+    "methods: {fedavg (old): }\nfamilies: [Bandit2D]": "does not say its algorithm; give it algo: fedavg",
+    "methods: {local: {parms: {}}}\nfamilies: [Bandit2D]": "unknown key in method 'local': 'parms'. Did you mean 'params'?",
+    "methods: {local: }\nfamilies: [Bandit3D]": "unknown environment 'Bandit3D'. Did you mean 'Bandit2D'?",
+    "methods: {local: }": "families is missing",
+    "methods: {local: }\nfamilies: [Bandit2D]\nseeds: [0, -1]": "the study.seeds",
+    "methods: {local: {seeds: [1, 1]}}\nfamilies: [Bandit2D]": "seeds of method 'local' names 1 twice",
+    "methods: {local: }\nfamilies: [Bandit2D]\nrounds: 0": "the study.rounds",
+    "methods: {local: }\nfamilies: [Bandit2D]\nbaseline: locl": "Did you mean 'local'?",
+    "methods: {local: }\nfamilies: [Bandit2D]\noverview: [G]": "unknown column in overview: 'G'",
+    "methods: {local: {families: [HopperHard]}}\nfamilies: [Bandit2D]": "unknown family of method 'local': 'HopperHard'",
+    "methods: {local: {params: {n_epoch: 1}}}\nfamilies: [Bandit2D]": "method 'local': unknown hyperparameter 'n_epoch'",
+    "methods: {local: {conf: papr}}\nfamilies: [Bandit2D]": "Did you mean 'paper'?",
+    "methods: {local: {delays: asink}}\nfamilies: [Bandit2D]": "--delays asink",
+    "methods: {local: , mine: {algo: local}}\nfamilies: [Bandit2D]": "'local' and 'mine' are both local with the label",
+    "methods: {local: , local: }": "the key 'local' stands twice",
+    "[1, 2]": "a study says at least",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_a_wrong_file_is_one_message_and_nothing_on_disk(text, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yml").write_text(text)
+    assert main(["--study", "mine.yml"]) == 2
+    captured = capfd.readouterr()
+    assert WRONG[text] in captured.err and "mine.yml" in captured.err and captured.out == "", captured.err
+    assert len(captured.err.splitlines()) == 1 and [path.name for path in tmp_path.iterdir()] == ["mine.yml"]
+
+
+FLAGS = {
+    "-params n_epochs:1": "-params is said in the file of a study",
+    "--label x": "--label is said in the file of a study",
+    "--envs HopperHard": "unknown family of the study: 'HopperHard'",
+    "--algos fedkl": "unknown method of the study: 'fedkl'",
+    "--seeds 7": "--seeds leaves no run of the study",
+    "--table-only": "has no results of Bandit2D",
+    "--table-only --dry-run": "contradict each other",
+}
+
+
+@pytest.mark.parametrize("line", FLAGS)
+def test_flags_that_contradict_a_study_are_refused(line, tmp_path, capfd):
+    path = write(tmp_path)
+    try:
+        code = main(["--study", path, *line.split()])
+    except SystemExit as exit:
+        code = exit.code
+    assert code == 2 and FLAGS[line] in capfd.readouterr().err
+    assert list(tmp_path.iterdir()) == [tmp_path / "mine.yml"]
+
+
+def test_latex_says_the_same_as_the_other_tables(tmp_path):
+    measures = [
+        replace(measure([read_result(result(tmp_path, level=level))]), method=name)
+        for name, level in (("fedavg (a_b) & more", -1.0), ("local", 2.0))
+    ]
+    rows = rows_of(measures)
+    lines = latex(Tables({"Bandit2D": measures}, (), ("100 %",))).splitlines()
+    assert lines[0] == "% needs \\usepackage{booktabs}" and lines[-1] == "% 100 %"
+    inside = lines[lines.index("\\midrule") + 1 : lines.index("\\bottomrule")]
+    assert inside[0].startswith("fedavg (a\\_b) \\& more & 1 & $-$3 & ") and inside[0].endswith(" \\\\")
+    assert inside[1].removesuffix(" \\\\").split(" & ") == list(rows[1].values())
+    assert f"{{l{'r' * (len(rows[0]) - 1)}}}" in lines[lines.index("\\toprule") - 1]
+
+
+def test_the_settings_of_one_method_are_drawn_differently():
+    looks = [style("fedguide-r", variant) for variant in range(8)]
+    assert len({(look.color, str(look.line), look.marker) for look in looks}) == len(looks)
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_committed_studies_can_be_read(path):
+    study = read_study(path)
+    assert study.title and set(study.families) <= set(fed_envs.FAMILIES)
+    assert all(Path(file).is_file() for file in study.metadata)
+    assert f"| `{path.stem}` | {study.title} |" in (path.parents[2] / "docs" / "reproduce.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_committed_studies_are_sound_and_fit_the_committed_results(path):
+    plan = plan_of(str(path))
+    assert plan.runs or plan.done
