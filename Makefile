@@ -7,13 +7,15 @@ RUNTIME := $(VENV)/.runtime-installed
 TOOLS := $(VENV)/.tools-installed
 FLOWER := $(VENV)/.flower-installed
 RAY := $(VENV)/.ray-installed
+NOTEBOOK := $(VENV)/.notebook-installed
+DIST := $(VENV)/.dist-installed
 SITE := $(VENV)/.site-installed
 # Small networks gain nothing from threads, and threads of several libraries get into each other's way.
 export OMP_NUM_THREADS ?= 1
 # A worker of the test suite takes about a gigabyte; make test WORKERS= runs all tests in one process.
 WORKERS ?= --numprocesses auto --maxprocesses 4 --dist worksteal
 
-.PHONY: help install train demo test test-slow test-flower test-flower-slow test-ray lint type docs format clean
+.PHONY: help install train demo test test-slow test-flower test-flower-slow test-ray test-dist lint type docs notebook dist format clean
 
 help:
 	@echo "make train      install, then FedGuide on HopperHard, end to end"
@@ -22,8 +24,11 @@ help:
 	@echo "make test-slow  the long tests as well"
 	@echo "make test-flower test-flower-slow  deployments over Flower, with real processes; installs Flower"
 	@echo "make test-ray   training and benchmarks on two Ray nodes; installs Ray"
+	@echo "make test-dist  the wheel in a fresh environment outside this folder, the source distribution's files"
 	@echo "make lint type  ruff, mypy"
 	@echo "make docs       these pages as a site, build/docs/index.html; warnings are errors; installs Sphinx"
+	@echo "make notebook   execute docs/notebooks again, in place, some minutes; installs a Jupyter kernel"
+	@echo "make dist       source distribution and wheel in dist/, checked by twine; uploads nothing"
 	@echo "make format     rewrite the code with ruff"
 	@echo "make clean      remove caches and builds; runs, logs and the environment stay"
 
@@ -36,8 +41,8 @@ demo: $(RUNTIME)
 test: $(TOOLS)
 	$(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
-test-slow: $(TOOLS)
-	FUZZ=1 $(BIN)/python -m pytest -m "not ray and not flower and not flower_slow" $(ARGS)
+test-slow: $(TOOLS) $(NOTEBOOK)
+	FUZZ=1 $(BIN)/python -m pytest -m "not ray and not flower and not flower_slow and not dist" $(ARGS)
 
 test-flower: $(TOOLS) $(FLOWER)
 	$(BIN)/python -m pytest -m flower $(ARGS)
@@ -47,6 +52,14 @@ test-flower-slow: $(TOOLS) $(FLOWER)
 
 test-ray: $(TOOLS) $(RAY)
 	$(BIN)/python -m pytest -m ray $(ARGS)
+
+dist: $(DIST)
+	rm -rf build/lib build/bdist.* dist
+	$(BIN)/python -m build --quiet
+	$(BIN)/python -m twine check --strict dist/*
+
+test-dist: $(TOOLS) dist
+	$(BIN)/python -m pytest -m dist $(ARGS)
 
 lint: $(TOOLS)
 	$(BIN)/python -m ruff check .
@@ -58,6 +71,9 @@ type: $(TOOLS)
 docs: $(SITE)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs $(ARGS)
 	@echo "build/docs/index.html"
+
+notebook: $(NOTEBOOK)
+	$(BIN)/jupyter-execute --inplace docs/notebooks/*.ipynb
 
 format: $(TOOLS)
 	$(BIN)/python -m ruff check --fix .
@@ -79,7 +95,7 @@ $(BIN)/python:
 # torch first: what follows finds its requirement met, by whichever build of it is wanted here
 $(RUNTIME): setup.cfg pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) install --quiet --constraint constraints.txt torch
-	$(PIP) install --quiet --constraint constraints.txt --editable .
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[metaworld]'
 	@touch $@
 
 $(TOOLS): $(RUNTIME)
@@ -88,6 +104,14 @@ $(TOOLS): $(RUNTIME)
 
 $(RAY): $(RUNTIME)
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[ray]'
+	@touch $@
+
+$(NOTEBOOK): $(RUNTIME)
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[notebook]'
+	@touch $@
+
+$(DIST): $(RUNTIME)
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[dist]'
 	@touch $@
 
 $(SITE): $(RUNTIME)
@@ -99,5 +123,5 @@ $(FLOWER): $(RUNTIME)
 	@touch $@
 
 clean:
-	rm -rf build dist docs/families *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf build dist docs/families docs/notebooks/*.md docs/notebooks/*.png *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

@@ -15,6 +15,7 @@ from sphinx.util.inspect import stringify_signature
 from sphinx.util.nodes import make_refnode
 
 sys.path.insert(0, str(Path(__file__).parent))
+import notebook_pages
 import pages
 
 from sb3_fedguide import __version__
@@ -86,6 +87,7 @@ def resolve_short_name(
 
 def setup(app: Sphinx) -> None:
     pages.write_pages()
+    notebook_pages.write_pages()
     app.connect("source-read", complete_page)
     app.connect("autodoc-process-signature", constructor_signature)
     app.connect("missing-reference", resolve_short_name)

@@ -41,12 +41,18 @@ def entry_point_of(world: str) -> str:
 def environment_class(world: str) -> Any:
     """The environment class of a kind of world.
 
-    :raises ValueError: where MuJoCo cannot be loaded for the way of rendering that ``MUJOCO_GL`` asks for
+    :raises ValueError: where the world needs metaworld, which is an extra, and it is not installed; or MuJoCo cannot be loaded
+        for the way of rendering that ``MUJOCO_GL`` asks for
     """
     module, name = ENTRY_POINTS[world].split(":")
     try:
         return getattr(import_module(module), name)
     except (ImportError, AttributeError) as error:
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "metaworld":
+            raise ValueError(
+                "MetaWorld10 needs metaworld, which is not installed: pip install 'sb3-fedguide[metaworld]' (it brings MuJoCo "
+                "3.3.0; every other family works without it)"
+            ) from error
         asked = os.environ.get("MUJOCO_GL")
         if not asked or "mujoco" in sys.modules:
             raise

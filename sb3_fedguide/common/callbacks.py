@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from fed_envs.state import State, declared_state, load_declared
 from sb3_fedguide.server.rounds import Rounds
