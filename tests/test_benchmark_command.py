@@ -199,7 +199,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint_with_the_same_result(tmp_path,
     """The training command itself: killed, gone on with, and equal to a run that nobody killed."""
     monkeypatch.setenv("FEDGUIDE_CACHE", str(tmp_path / "cache"))
     settings = [
-        "--rounds", "30", "--eval-episodes", "2", "--save-freq", "3", "-params", "bc_weight:0", "n_epochs:1",
+        "--rounds", "12", "--eval-episodes", "2", "--save-freq", "3", "-params", "bc_weight:0", "n_epochs:1",
         "policy_kwargs.net_arch:[8]",
     ]  # fmt: skip
     argv = ["--algos", "local", "--envs", "Bandit2D", "--seeds", "5", *settings, "-f", str(tmp_path / "results")]

@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import os
 import resource
+import shutil
 import sys
 import traceback
 from pathlib import Path
@@ -62,8 +63,14 @@ def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> Non
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory) -> dict[str, np.ndarray]:
-    return results(tmp_path_factory.mktemp("reference"))
+def kept(tmp_path_factory) -> Path:
+    """A cache that nothing is wrong with, to be copied."""
+    return tmp_path_factory.mktemp("kept")
+
+
+@pytest.fixture(scope="module")
+def reference(kept) -> dict[str, np.ndarray]:
+    return results(kept)
 
 
 def entries(cache: Path) -> list[Path]:
@@ -185,8 +192,8 @@ def test_the_cache_of_a_real_file_size_limit(limit, reference, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "flipped", "folder", "foreign", "renamed", "compressed"])
-def test_a_damaged_entry_of_every_piece_is_made_again(damage, reference, tmp_path, caplog):
-    assert_same(results(tmp_path), reference)
+def test_a_damaged_entry_of_every_piece_is_made_again(damage, reference, kept, tmp_path, caplog):
+    shutil.copytree(kept, tmp_path, dirs_exist_ok=True)
     before = {path: path.read_bytes() for path in entries(tmp_path)}
     pieces = [path for path in before if path.parent.parent.name == "pretraining" or path.name == "rows.npz"]
     assert len(pieces) == 1 + 3 * 2 + 4  # the trunk; bc, dice and prior of two clients; and all four clients' data
