@@ -17,14 +17,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from fed_envs import Family, FederatedVecEnv
 from fed_envs.clients import PointMazeClient
-from fed_envs.mazes import WALL, maze_rows
+from fed_envs.mazes import maze_rows
 from fed_envs.point_maze import SUCCESS_DISTANCE
+from sb3_fedguide.benchmark.figures.mazes import draw_maze
 from sb3_fedguide.cli import saved_run
 from sb3_fedguide.seeding import EVALUATION_SEED, Role
 
@@ -79,14 +79,6 @@ def roll_out(method: str, family: Family, model: Any, n_episodes: int, seed: int
     return Episodes(method, np.stack(path, axis=1).reshape(*shape, len(path), -1), returns.reshape(shape))
 
 
-def _maze(axes: Axes, rows: tuple[str, ...]) -> None:
-    """Walls grey, seen from above; of the border's walls a strip."""
-    height, width = len(rows), len(rows[0])
-    walls = np.array([[cell == WALL for cell in row] for row in rows], dtype=float)
-    axes.imshow(walls, cmap="Greys", vmin=0, vmax=2, extent=(-width / 2, width / 2, -height / 2, height / 2))
-    axes.set(xticks=[], yticks=[], xlim=(0.7 - width / 2, width / 2 - 0.7), ylim=(0.7 - height / 2, height / 2 - 0.7))
-
-
 def draw(family: Family, methods: Sequence[Episodes], path: Path) -> None:
     """Write the figure.
 
@@ -101,7 +93,7 @@ def draw(family: Family, methods: Sequence[Episodes], path: Path) -> None:
             line, family.clients, episodes.observations, episodes.returns, episodes.successes, strict=True
         ):
             assert isinstance(client, PointMazeClient)
-            _maze(axes, maze_rows(client.maze))
+            draw_maze(axes, maze_rows(client.maze))
             for one in paths:
                 axes.plot(one[:, 0], one[:, 1], color=COLORS[number % len(COLORS)], linewidth=1.1, alpha=0.8)
             axes.plot(*paths[:, 0, :2].T, "o", color="black", markersize=3, label="start")

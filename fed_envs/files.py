@@ -1,10 +1,11 @@
-"""Files that appear complete or not at all."""
+"""Files that appear complete or not at all, and tables that grow with a run."""
 
 from __future__ import annotations
 
+import csv
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -39,3 +40,42 @@ def current_umask() -> int:
     umask = os.umask(0)
     os.umask(umask)
     return umask
+
+
+class GrowingTable:
+    """A CSV to which a run adds rows, and which is as long as the run's checkpoint says when the run goes on.
+
+    :param path: of the file; there is none before the header is written
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+
+    @property
+    def size(self) -> int | None:
+        """Bytes that are written; ``None`` where there is no file."""
+        return self.path.stat().st_size if self.path.exists() else None
+
+    def begin(self, columns: Sequence[str]) -> None:
+        """Write the header, unless there is a file."""
+        if not self.path.exists():
+            with self.path.open("w", newline="", encoding="utf-8") as file:
+                csv.writer(file).writerow(columns)
+
+    def add(self, rows: Iterable[Sequence[Any]]) -> None:
+        """Append rows; they are on the disk when this returns."""
+        with self.path.open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows(rows)
+            file.flush()
+            os.fsync(file.fileno())
+
+    def cut(self, size: int | None) -> None:
+        """Forget the rows that were written after the table had ``size`` bytes: they will be written again.
+
+        :raises ValueError: where rows are missing that were there
+        """
+        if size is None:
+            return
+        if (found := self.size or 0) < size:
+            raise ValueError(f"{self.path} has {found} bytes and had {size} when the checkpoint was written: rows are missing")
+        os.truncate(self.path, size)

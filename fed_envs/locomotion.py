@@ -162,6 +162,7 @@ class LocomotionEnv(MujocoClientEnv[LocomotionClient]):
 
     world = "locomotion"
     batch_class = LocomotionBatch
+    camera_name = "track"  # it follows the body, which a free camera of Gymnasium 1.4 does not do
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ import copy
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -32,6 +32,8 @@ class MujocoClientEnv(ClientEnv[ClientT]):
     :param height: height of rendered images in pixels
     """
 
+    #: a camera of the model that pictures are taken by, instead of one with the settings of :meth:`_camera`
+    camera_name: ClassVar[str | None] = None
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}  # noqa: RUF012
     _batch: MujocoBatch[Any]
 
@@ -104,7 +106,8 @@ class MujocoClientEnv(ClientEnv[ClientT]):
 
             screen = self.model.vis.global_
             screen.offwidth, screen.offheight = max(screen.offwidth, self.width), max(screen.offheight, self.height)
-            self._renderer = MujocoRenderer(self.model, self.data, self._camera(), self.width, self.height)
+            settings = {"camera_name": self.camera_name} if self.camera_name else {"camera_id": -1}
+            self._renderer = MujocoRenderer(self.model, self.data, self._camera(), self.width, self.height, **settings)
         return self._renderer.render(self.render_mode)
 
     def close(self) -> None:

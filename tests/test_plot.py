@@ -32,7 +32,7 @@ def test_the_command_writes_every_figure_that_the_data_allow(tmp_path, capfd):
     out = tmp_path / "new" / "figures"
     flags = ["plot", "-f", str(tmp_path), "--envs", "Bandit2D", "--metadata", str(mine), "-o", str(out)]
     assert main(flags) == 0
-    names = {"curves-average-rounds", "bars", "clients-Bandit2D", "clients-Mine", "aggregate", "speedup"}
+    names = {"curves-average-rounds", "bars", "cv", "clients-Bandit2D", "clients-Mine", "aggregate", "speedup"}
     assert {path.name for path in out.iterdir()} == {f"{name}.png" for name in names}
     assert all(is_picture(path) for path in out.iterdir())
     captured = capfd.readouterr()
@@ -56,7 +56,7 @@ def test_what_the_data_do_not_allow_is_left_out_with_a_reason(tmp_path, capfd):
     assert main(["plot", "-f", str(tmp_path), "--envs", "Bandit2D", "-o", str(tmp_path / "out")]) == 0
     lines = capfd.readouterr().err.splitlines()
     assert len(lines) == 2 and "left out aggregate: " in lines[0] and "left out speedup: " in lines[1]
-    assert {path.stem for path in (tmp_path / "out").iterdir()} == {"curves-average-rounds", "bars", "clients-Bandit2D"}
+    assert {path.stem for path in (tmp_path / "out").iterdir()} == {"curves-average-rounds", "bars", "cv", "clients-Bandit2D"}
 
 
 def test_results_of_several_labels_stand_side_by_side(tmp_path, monkeypatch):
@@ -141,6 +141,10 @@ WRONG = {
     "--envs Bandit2D --figures curve": "unknown figure 'curve'. Did you mean 'curves'?",
     "--envs Bandit2D --figures aggregate": "aggregate: it needs finished runs on several families",
     "--envs Bandit2D --figures bars speedup": "speedup: it needs finished runs of the baseline, local, and of another",
+    "--envs Bandit2D --figures rollouts": "rollouts is drawn from folders of runs, e.g. logs/*/HopperHard_1",
+    "{run} --figures plan": "plan: no plan.csv in {run}: the method has no transport plan, or the run is",
+    "{run} --figures bars --clients 1": "--clients is for rollouts; add rollouts to --figures",
+    "{run} --figures rollouts": "is not the folder of a trained run: it has no config.yml",
     "--envs Bandit2D --figures bars --of worst": "--of is for learning curves; add curves to --figures",
     "--envs Bandit2D --label plain -x steps": "curves: {folder}/Bandit2D-plain/local-seed0.json does not say the environment",
     "--envs Bandit2D --label plain --of worst": "no returns of single clients",

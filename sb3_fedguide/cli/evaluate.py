@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.cli.arguments import OneLineParser
 from sb3_fedguide.cli.output import pipe_may_close
-from sb3_fedguide.cli.saved_run import load_model, read_run
+from sb3_fedguide.cli.rendering import check_rendering
+from sb3_fedguide.cli.saved_run import in_place, load_model, read_run
+from sb3_fedguide.cli.video import FORMATS, check_format, write_videos
 from sb3_fedguide.settings.packages import import_packages
 
 if TYPE_CHECKING:
     import numpy as np
-    from stable_baselines3.common.base_class import BaseAlgorithm
 
     from fed_envs import Family
     from sb3_fedguide.common.evaluation import Evaluation
     from sb3_fedguide.common.federation import Federation
     from sb3_fedguide.settings.config import Config
-
-#: A picture file's frames: more would make it unwieldy.
-MAX_FRAMES = 200
 
 
 @pipe_may_close
@@ -44,7 +40,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide evaluate") -> 
         model = load_model(Path(arguments.run), config, family)
         policies = _policies(arguments, Path(arguments.run), model)
         if arguments.video is not None:
-            _check_rendering(family)
+            check_rendering(family, "--video")
     except (ValueError, OSError) as error:
         parser.error(" ".join(str(error).split()))
     result = _evaluate(arguments, run, family, model, policies)
@@ -74,7 +70,8 @@ def _parser(prog: str) -> OneLineParser:
          "of your own")  # fmt: skip
     flag("--stochastic", action="store_true", help="sample actions instead of taking their mean")
     flag("-o", "--output", metavar="FILE", help="write the JSON there instead of to the terminal")
-    flag("--video", metavar="DIR", help="write one animated picture (GIF) of each client's first episode there")
+    flag("--video", metavar="DIR", help="write a video of each client's first episode there")
+    flag("--video-format", choices=FORMATS, default="gif", help="gif, or mp4, which needs pip install 'sb3-fedguide[video]'")
     return parser
 
 
@@ -104,7 +101,8 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.video is not None:
         from sb3_fedguide.cli.run_folder import check_log_folder
 
-        check_log_folder(Path(arguments.video))
+        check_log_folder(Path(arguments.video), "video folder", "--video")
+        check_format(arguments.video_format)
 
 
 def _policies(arguments: argparse.Namespace, folder: Path, model: Federation) -> dict[str, dict[str, np.ndarray]]:
@@ -127,17 +125,6 @@ def _policies(arguments: argparse.Namespace, folder: Path, model: Federation) ->
     return found if arguments.policy == "both" else {arguments.policy: found[arguments.policy]}
 
 
-@contextmanager
-def _in_place(model: Federation, arrays: dict[str, np.ndarray]) -> Iterator[None]:
-    """The model with other parameters for a while."""
-    before = model.acting_arrays()
-    model.set_acting_arrays(arrays)
-    try:
-        yield
-    finally:
-        model.set_acting_arrays(before)
-
-
 def _evaluate(
     arguments: argparse.Namespace,
     run: dict[str, Any],
@@ -153,12 +140,15 @@ def _evaluate(
     results = {}
     for name, arrays in policies.items():
         env = evaluation_env(model, arguments.episodes)
-        with _in_place(model, arrays):
+        with in_place(model, arrays):
             results[name] = _numbers(
                 evaluate_federation(lambda obs: model.predict(obs, deterministic=deterministic)[0], env, arguments.seed)
             )
             if arguments.video is not None:
-                _write_videos(Path(arguments.video), name, family, model, arguments.seed)
+                written = write_videos(
+                    Path(arguments.video), name, run["algo"], family, model, arguments.video_format, arguments.seed
+                )
+                print(*(f"wrote {path}" for path in written), sep="\n", file=sys.stderr)
         env.close()
     return {
         "run": str(arguments.run),
@@ -183,39 +173,3 @@ def _numbers(evaluation: Evaluation) -> dict[str, Any]:
         "client_lengths": evaluation.lengths.mean(axis=1).tolist(),
         "returns": evaluation.returns.tolist(),
     }
-
-
-def _check_rendering(family: Family) -> None:
-    """:raises ValueError: where nothing can be drawn"""
-    env = family.make(0)
-    modes = env.metadata.get("render_modes", [])
-    env.close()
-    if "rgb_array" not in modes:
-        raise ValueError(f"--video: {family.name} cannot be drawn")
-    display = sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"))
-    if not display and family.world != "bandit2d":  # MuJoCo's default would end the process
-        raise ValueError("--video: there is no display; set MUJOCO_GL=osmesa (Debian: libosmesa6) or MUJOCO_GL=egl")
-
-
-def _write_videos(folder: Path, policy: str, family: Family, model: Federation, seed: int) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for client in model.client_ids:
-        path = folder / f"{family.name}-client{client}-{policy}.gif"
-        _write_video(path, family, client, model.client(client), seed)
-        print(f"wrote {path}", file=sys.stderr)
-
-
-def _write_video(path: Path, family: Family, client: int, policy: BaseAlgorithm, seed: int) -> None:
-    from PIL import Image
-
-    env = family.make(client, render_mode="rgb_array")
-    every = max(1, family.max_episode_steps // MAX_FRAMES)
-    obs, _ = env.reset(seed=seed)
-    frames, step, done = [], 0, False
-    while not done:
-        if step % every == 0:
-            frames.append(Image.fromarray(env.render()).resize((240, 240)))  # type: ignore[arg-type]
-        obs, _, terminated, truncated, _ = env.step(policy.predict(obs, deterministic=True)[0])
-        step, done = step + 1, terminated or truncated
-    env.close()
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=40, loop=0)

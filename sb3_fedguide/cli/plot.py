@@ -29,9 +29,10 @@ if TYPE_CHECKING:
 SHARED = ("algos", "envs", "metadata", "seeds", "folder", "baseline", "gym_packages")
 #: Those that choose results of a benchmark, so that they say nothing about run folders.
 OF_BENCHMARK = ("algos", "metadata", "seeds", "label")
-FIGURES = ("curves", "bars", "clients", "aggregate", "speedup")
-#: Those that are drawn from the logs of runs, in their folders.
-OF_LOGS = ("lemma2", "theorem3")
+FIGURES = ("curves", "bars", "cv", "clients", "aggregate", "speedup")
+#: Those that are drawn from folders of runs only, and only where they are asked for: from their logs, and from their policies.
+OF_LOGS, OF_POLICIES = ("lemma2", "theorem3"), ("rollouts", "plan")
+OF_FOLDERS = OF_LOGS + OF_POLICIES
 #: Flags of the learning curves, and what they are by default.
 OF_CURVES = {"x": "rounds", "of": "average", "band": "range"}
 
@@ -84,9 +85,10 @@ def _parse(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
         "--figures",
         nargs="+",
         metavar="FIGURE",
-        help=f"{', '.join(FIGURES + OF_LOGS)}; by default all that the data allow, "
-        f"without {' and '.join(OF_LOGS)}, which take folders of runs",
+        help=f"{', '.join(FIGURES)}; by default all that the data allow; and of run folders: lemma2, theorem3, "
+        "rollouts (an episode of each client), plan (who listens to whom, FedGuide)",
     )
+    flag("--clients", nargs="+", type=int, metavar="K", help="of rollouts: the clients to draw; by default all")
     flag("-x", choices=("rounds", "steps", "seconds", "bytes"), help="what learning curves are drawn over; by default rounds")
     flag("--of", choices=("average", "worst", "clients"), help="what learning curves show: the clients' average (default), "
          "the worst client, or each client in a panel of its own")  # fmt: skip
@@ -115,7 +117,11 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ValueError("give folders of runs or --envs, not both")
     if arguments.runs and (given := [name for name in OF_BENCHMARK if getattr(arguments, name)]):
         raise ValueError(f"--{given[0]} chooses results of a benchmark (--envs); with folders of runs, leave it out")
-    check_names(arguments.figures or (), FIGURES + OF_LOGS, "figure")
+    check_names(arguments.figures or (), (*FIGURES, *OF_FOLDERS), "figure")
+    if arguments.clients and "rollouts" not in (arguments.figures or ()):
+        raise ValueError("--clients is for rollouts; add rollouts to --figures")
+    if not arguments.runs and (given := [name for name in OF_FOLDERS if name in (arguments.figures or ())]):
+        raise ValueError(f"{given[0]} is drawn from folders of runs, e.g. logs/*/HopperHard_1; give them instead of --envs")
     given = [name for name in OF_CURVES if getattr(arguments, name) is not None]
     if given and arguments.figures and "curves" not in arguments.figures:
         raise ValueError(f"-{'' if given[0] == 'x' else '-'}{given[0]} is for learning curves; add curves to --figures")
@@ -230,6 +236,13 @@ def _draw(
         if figure == "lemma2":
             return [(figure, draw_lemma2(read_logs(comparison)))]
         return [(figure, draw_theorem3(read_logs(averages(comparison))))]
+    if figure in OF_POLICIES:
+        from sb3_fedguide.cli import plot_rollouts as folders
+
+        if figure == "rollouts":
+            return [(f"rollouts-{_file_name(family)}", folders.rollouts(runs, arguments.clients))
+                    for family, runs in comparison.items()]  # fmt: skip
+        return folders.plans(comparison, _file_name, notes)
     if figure == "curves":
         name = f"curves-{arguments.of}-{arguments.x}"
         if arguments.of != "clients":
@@ -240,6 +253,8 @@ def _draw(
         ]
     if figure == "bars":
         return [("bars", bars.draw_bars(comparison))]
+    if figure == "cv":
+        return [("cv", bars.draw_cv(comparison))]
     if figure == "clients":
         return [(f"clients-{_file_name(family)}", clients.draw_clients(family, runs)) for family, runs in comparison.items()]
     if figure == "speedup":

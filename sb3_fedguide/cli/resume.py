@@ -163,11 +163,12 @@ def load_checkpoint(folder: Path, load: Callable[[Path], Any], prog: str) -> boo
     :return: whether there was one
     :raises ValueError: if none can be read
     """
-    from sb3_fedguide.cli.run_folder import CHECKPOINTS, EVALUATIONS, versions
+    from sb3_fedguide.cli.run_folder import CHECKPOINTS, EVALUATIONS, PLAN, versions
     from sb3_fedguide.common.checkpoint import checkpoints
 
     if not checkpoints(folder / CHECKPOINTS):
-        (folder / EVALUATIONS).unlink(missing_ok=True)
+        for table in (EVALUATIONS, PLAN):
+            (folder / table).unlink(missing_ok=True)
         return False
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

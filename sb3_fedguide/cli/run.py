@@ -183,7 +183,7 @@ class Run:
         self._costs.pretraining_seconds = self._costs.total_seconds
         checkpoint = CheckpointCallback(folder / CHECKPOINTS, arguments.save_freq) if arguments.save_freq else None
         recorders = [self._evaluation, self._costs, self._deployed, status]
-        callbacks = [*recorders, *self._monitoring(), checkpoint, StopCallback(signals, checkpoint)]
+        callbacks = [*recorders, *self._monitoring(folder), checkpoint, StopCallback(signals, checkpoint)]
         engine = make_engine(arguments.engine, arguments.num_actors, arguments.ray_address)
         with ExitStack() as stack:
             if engine is not None:
@@ -205,15 +205,18 @@ class Run:
             progress_bar=self.arguments.progress,
         )
 
-    def _monitoring(self) -> list[RoundCallback]:
+    def _monitoring(self, folder: Path) -> list[RoundCallback]:
+        from sb3_fedguide.cli.run_folder import PLAN
         from sb3_fedguide.monitoring.callbacks import TensorBoardCallback
         from sb3_fedguide.monitoring.diagnostics import DiagnosticsCallback
         from sb3_fedguide.monitoring.health import HealthCallback
+        from sb3_fedguide.monitoring.plan import PlanCallback
         from sb3_fedguide.settings.schema import all_names
 
         shown = {"algo": self.arguments.algo, "family": self.family.name, "seed": self.model.seed, **self.config.values}
         pictures = TensorBoardCallback(self.config.n_rounds, self.arguments.picture_freq, shown, all_names())
-        return [DiagnosticsCallback(self._evaluation if self.arguments.eval_average else None), HealthCallback(), pictures]
+        diagnostics = DiagnosticsCallback(self._evaluation if self.arguments.eval_average else None)
+        return [diagnostics, HealthCallback(), PlanCallback(folder / PLAN), pictures]
 
     def _summary(self) -> dict[str, Any]:
         from sb3_fedguide.cli.report import summarize

@@ -23,6 +23,8 @@ PARAMETERS = "parameters.npz"
 DEPLOYED = "deployed.npz"
 CHECKPOINTS = "checkpoints"
 EVALUATIONS = "evaluations.csv"
+#: The transport plan of each round, of methods that have one: see :mod:`sb3_fedguide.monitoring.plan`.
+PLAN = "plan.csv"
 #: The stage of a run that is under way: see :mod:`sb3_fedguide.cli.status`.
 STATUS = "status.json"
 PACKAGES = (

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,3 +86,14 @@ def read_deployed_policies(folder: Path, model: Federation) -> dict[str, np.ndar
     if broken := [name for name, array in deployed.items() if not np.isfinite(array).all()]:
         raise ValueError(f"{folder / DEPLOYED}: {broken[0]} has non-finite entries")
     return deployed
+
+
+@contextmanager
+def in_place(model: Federation, arrays: dict[str, np.ndarray]) -> Iterator[None]:
+    """The model with other parameters for a while."""
+    before = model.acting_arrays()
+    model.set_acting_arrays(arrays)
+    try:
+        yield
+    finally:
+        model.set_acting_arrays(before)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +11,11 @@ import numpy as np
 
 from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
+from fed_envs.files import GrowingTable
 from fed_envs.state import State, freeze, thaw
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.episodes import truth
+from sb3_fedguide.deployment.metrics import EVALUATION_COLUMNS
 from sb3_fedguide.seeding import EVALUATION_SEED, Role
 
 if TYPE_CHECKING:
@@ -156,14 +156,13 @@ class FederatedEvalCallback(RoundCallback):
         if eval_freq < 1 or n_episodes < 1:
             raise ValueError(f"eval_freq={eval_freq} and n_episodes={n_episodes} must be at least 1")
         self.n_rounds, self.eval_freq, self.n_episodes, self.deterministic = n_rounds, eval_freq, n_episodes, deterministic
-        self.csv_path, self.max_steps = None if csv_path is None else Path(csv_path), max_steps
+        self.table, self.max_steps = None if csv_path is None else GrowingTable(csv_path), max_steps
         #: the last evaluation of the deployed and of the broadcast policy
         self.last: dict[str, Evaluation] = {}
 
     def save_state(self) -> State:
         evaluations = {policy: freeze(vars(evaluation)) for policy, evaluation in self.last.items()}
-        written = self.csv_path is not None and self.csv_path.exists()
-        size = self.csv_path.stat().st_size if written else None  # type: ignore[union-attr]
+        size = None if self.table is None else self.table.size
         return {**super().save_state(), "evaluations": evaluations, "csv_size": size}
 
     def load_state(self, state: State) -> None:
@@ -173,22 +172,13 @@ class FederatedEvalCallback(RoundCallback):
         """
         super().load_state({name: state[name] for name in state.keys() - {"evaluations", "csv_size"}})
         self.last = {policy: Evaluation(**thaw(values)) for policy, values in state["evaluations"].items()}
-        if self.csv_path is None or state["csv_size"] is None:
-            return
-        size = self.csv_path.stat().st_size if self.csv_path.exists() else 0
-        if size < state["csv_size"]:
-            raise ValueError(
-                f"{self.csv_path} has {size} bytes and had {state['csv_size']} when the checkpoint was written: rows are "
-                "missing"
-            )
-        os.truncate(self.csv_path, state["csv_size"])
+        if self.table is not None:
+            self.table.cut(state["csv_size"])
 
     def _on_training_start(self) -> None:
         self.env = evaluation_env(self.model, self.n_episodes)
-        if self.csv_path is not None and not self.csv_path.exists():
-            header = ("round", "timesteps", "policy", "client", "mean_return", "std_return", "mean_length", "success_rate")
-            with self.csv_path.open("w", newline="") as file:
-                csv.writer(file).writerow(header)
+        if self.table is not None:
+            self.table.begin(EVALUATION_COLUMNS)
 
     def is_due(self, round: int) -> bool:
         """Whether the deployed policies are evaluated after the local training of round ``round``, counted from 1."""
@@ -230,11 +220,8 @@ class FederatedEvalCallback(RoundCallback):
     def _evaluate(self, policy: str, round: int) -> Evaluation:
         evaluation = self.run()
         self.last[policy] = evaluation
-        if self.csv_path is not None:
-            with self.csv_path.open("a", newline="") as file:
-                csv.writer(file).writerows(self._rows(policy, round, evaluation))
-                file.flush()
-                os.fsync(file.fileno())
+        if self.table is not None:
+            self.table.add(self._rows(policy, round, evaluation))
         return evaluation
 
     def _rows(self, policy: str, round: int, evaluation: Evaluation) -> list[tuple[Any, ...]]:

@@ -112,7 +112,7 @@ def chart_layout(model: Federation) -> Layout:
         if model.uses_dice:
             parts += [_DICE]
         parts += [_TRANSPORT]
-    servers = list(_flat(model.strategy))
+    servers = list(flat(model.strategy))
     if any(isinstance(server, Averaging) for server in servers):
         parts += [_AVERAGING]
     if any(isinstance(server, SVRPG) for server in servers):
@@ -125,10 +125,11 @@ def chart_layout(model: Federation) -> Layout:
     return layout
 
 
-def _flat(strategy: Strategy | None) -> Iterable[Strategy]:
+def flat(strategy: Strategy | None) -> Iterable[Strategy]:
+    """A strategy's parts, or itself."""
     if isinstance(strategy, Composite):
         for part in strategy.strategies:
-            yield from _flat(part)
+            yield from flat(part)
     elif strategy is not None:
         yield strategy
 

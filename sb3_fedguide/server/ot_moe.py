@@ -145,20 +145,28 @@ def head_oddity(heads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return agreement, distance
 
 
-def head_shares(plan: np.ndarray) -> np.ndarray:
-    """What the other clients' mixtures hold of each client's head, on average: ``1 / n_clients`` where all share alike.
+def given_heads(plan: np.ndarray) -> np.ndarray:
+    """What each client's mixture holds of every client's head: who listens to whom.
 
     Client j's mixture weighs expert m with ``P_jm / sum_m P_jm``, and that expert weighs client i's head with
     ``P_im / sum_i P_im`` (paper, Eq. 9 and 10).
 
     :param plan: ``(n_clients, n_experts)``
-    :return: ``(n_clients,)``
+    :return: of head i in client j's mixture at [j, i], ``(n_clients, n_clients)``; rows sum to one
     """
-    n = len(plan)
     rows = plan / plan.sum(axis=1, keepdims=True)
     columns = plan / np.maximum(plan.sum(axis=0), np.finfo(float).tiny)
-    given = rows @ columns.T  # of head i to client j at [j, i]
-    return (given.sum(axis=0) - np.diag(given)) / (n - 1)
+    return rows @ columns.T
+
+
+def head_shares(plan: np.ndarray) -> np.ndarray:
+    """What the other clients' mixtures hold of each client's head, on average: ``1 / n_clients`` where all share alike.
+
+    :param plan: ``(n_clients, n_experts)``, see :func:`given_heads`
+    :return: ``(n_clients,)``
+    """
+    given = given_heads(plan)
+    return (given.sum(axis=0) - np.diag(given)) / (len(plan) - 1)
 
 
 def scale_cost(cost: np.ndarray, scaling: Literal["max", "median"]) -> np.ndarray:
@@ -227,6 +235,8 @@ class OTMoE(Strategy):
         self.rng = np.random.default_rng(seed)
         self.experts: np.ndarray | None = None
         self.plan: np.ndarray | None = None
+        #: clients of the plan's rows
+        self.routed: list[int] = []
         self.rows: dict[int, np.ndarray] = {}
         self._potentials: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -250,6 +260,7 @@ class OTMoE(Strategy):
         cost = scale_cost(raw, self.cost_scaling)
         start = self._potentials if self._potentials is not None and len(self._potentials[0]) == len(clients) else None
         self.plan, error, self._potentials = sinkhorn_plan(cost, self.eta, start=start)  # Eq. 8, the transport plan
+        self.routed = clients
         rows = self.plan / self.plan.sum(axis=1, keepdims=True)  # Eq. 10, weights of the personal prior
         self.rows.update(zip(clients, rows.astype(np.float32), strict=True))
         self._look_at_heads(clients, heads)

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from sb3_fedguide.benchmark.figures.layout import MEDIUM, SMALL, fit_scale, legend, panels
 from sb3_fedguide.benchmark.figures.runs import Comparison, Runs, base, require_finished, seeds
 from sb3_fedguide.benchmark.figures.styles import style
-from sb3_fedguide.benchmark.results import measure, speed_up
+from sb3_fedguide.benchmark.results import LAST_ROUNDS, measure, speed_up, volatility
 
 ROW = 0.27  # inches of one bar
 _DOT: dict[str, Any] = {
@@ -96,6 +96,32 @@ def draw_speed_up(comparison: Comparison, baseline: str = "local") -> Figure:
             f"speed-up: steps of a whole run over steps\nuntil F of {baseline}, {target:.4g}, is reached", fontsize=MEDIUM
         )
     legend(figure, _marks([("one seed's curve\n(none: not reached)", _DOT)]), "bar: mean curve of all seeds")
+    return figure
+
+
+def draw_cv(comparison: Comparison) -> Figure:
+    """How much the return still moves in the last twenty rounds, one panel per family.
+
+    :raises ValueError: where no run has evaluated enough of its last rounds
+    """
+    values = {
+        family: {
+            name: [value for result in group if (value := volatility(result)) is not None] for name, group in results.items()
+        }
+        for family, results in require_finished(comparison).items()
+    }
+    values = {family: {name: found for name, found in groups.items() if found} for family, groups in values.items()}
+    values = {family: groups for family, groups in values.items() if groups}
+    if not values:
+        raise ValueError("no finished run has several evaluations in its last rounds")
+    rows = max(len(groups) for groups in values.values())
+    figure, grid = panels(len(values), (3.8, 1.1 + ROW * max(rows, 3)), columns=2, beside=1.6)
+    for axes, (family, groups) in zip(grid, values.items(), strict=True):
+        _bars(axes, {name: float(np.mean(found)) for name, found in groups.items()}, groups, comparison[family])
+        axes.set_title(family, fontsize=MEDIUM, loc="left")
+        axes.set_xlabel(f"CV: deviation over absolute mean of the\nclient-average return, last {LAST_ROUNDS} rounds",
+                        fontsize=MEDIUM)  # fmt: skip
+    legend(figure, _marks([("one seed", _DOT)]), "bar: mean over seeds\nshorter: steadier")
     return figure
 
 
