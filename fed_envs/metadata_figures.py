@@ -45,14 +45,16 @@ def heterogeneity(family: Family, client_ids: Sequence[int] | None = None, width
     labels = [f"{client.client} {text}".strip() for client, text in zip(clients, words, strict=True)]
     columns, rows = spread(len(clients), MAX_LABELS), spread(len(names), MAX_ROWS)
     turned = any(words) or len(clients) > MAX_ANNOTATED
-    axes.set(xlabel="client", xticks=columns, yticks=rows)
+    axes.set(xlabel="client", ylabel="parameter", xticks=columns, yticks=rows)
     axes.set_xticklabels([labels[column] for column in columns], rotation=90 if turned else 0, fontsize=7)
     axes.set_yticklabels([names[row].replace("_", " ") for row in rows], fontsize=7)
-    axes.set_title(f"{family.name}: clients' parameters\ncolours: standard deviations from the mean", fontsize=8, loc="left")
+    axes.set_title(f"{family.name}: clients' parameters", fontsize=8, loc="left")
     if len(clients) <= MAX_ANNOTATED:
         texts = [[_short(value) for value in row] for row in values.T]
         annotate(axes, texts, np.where(np.abs(standardised.T) > 0.6 * limit, "white", "black"))
-    figure.colorbar(image, ax=axes, ticks=[-2, 0, 2]).ax.tick_params(labelsize=8)
+    scale = figure.colorbar(image, ax=axes, ticks=[-2, 0, 2])
+    scale.ax.tick_params(labelsize=8)
+    scale.set_label("standard deviations from the mean", fontsize=7)
     return figure
 
 

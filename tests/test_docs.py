@@ -12,7 +12,7 @@ import gymnasium as gym
 import pytest
 
 from fed_envs import FAMILIES, load_family
-from sb3_fedguide.cli import benchmark_arguments, deploy, evaluate, export
+from sb3_fedguide.cli import benchmark_arguments, deploy, evaluate, export, pull, push
 from sb3_fedguide.cli.arguments import parse_train, train_parser
 from sb3_fedguide.cli.main import USAGE
 from sb3_fedguide.registry import ALGORITHMS, algorithm
@@ -103,8 +103,8 @@ def check_command(words: list[str]) -> None:
         options = benchmark_arguments.parse_benchmark(arguments, "fedguide benchmark")
         for name in set(options.algos or ()) & set(ALGORITHMS):
             resolve(name, load_family(options.envs[0]), overrides=parse_params(options.hyperparams))
-    elif command in ("evaluate", "export"):
-        {"evaluate": evaluate, "export": export}[command]._parser(command).parse_strictly(arguments)
+    elif command in (commands := {"evaluate": evaluate, "export": export, "push": push, "pull": pull}):
+        commands[command]._parser(command).parse_strictly(arguments)
     elif command == "deploy":
         deploy._parser().parse_strictly(arguments)
     elif command == "dataset":

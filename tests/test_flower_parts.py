@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -316,3 +318,51 @@ def test_the_pinned_app_refuses_a_flower_without_what_it_replaces(monkeypatch: p
     monkeypatch.setattr(flower, "run_clientapp", lambda *_, **__: pytest.fail("the app was run"))
     with pytest.raises(RuntimeError, match="no install_from_fab"):
         run_installed_app("127.0.0.1:1", "token")
+
+
+def test_the_journal_has_the_lines_of_this_package_and_of_others_what_is_wrong(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from sb3_fedguide.cli.deploy import QUIET
+    from sb3_fedguide.deployment.flower import server_app
+
+    for name in QUIET:
+        monkeypatch.setenv(name, "")
+        del os.environ[name]
+    assert fedguide(["deploy", "server", "nowhere.yml"]) == 2
+    assert (os.environ["FLWR_LOG_LEVEL"], os.environ["GRPC_VERBOSITY"]) == ("WARNING", "ERROR")  # read by Flower's processes
+    root = logging.getLogger()
+    handlers, levels = root.handlers[:], {name: logging.getLogger(name).level for name in ("", "sb3_fedguide")}
+    try:
+        server_app.set_up_journal()
+        for name in ("grpc", "httpx", "some_other_package"):
+            assert not logging.getLogger(name).isEnabledFor(logging.INFO) and logging.getLogger(name).isEnabledFor(
+                logging.WARNING
+            )
+        assert logging.getLogger("sb3_fedguide.deployment.serve").isEnabledFor(logging.INFO)
+    finally:
+        root.handlers[:] = handlers
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
+        logging.getLogger("flwr").propagate = True
+
+
+def test_the_example_on_one_machine_is_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sb3_fedguide.deployment.files import ClientDeployment, ServerDeployment
+    from sb3_fedguide.deployment.site_config import read_site_config
+
+    text = (Path(__file__).parent.parent / "docs" / "deployment.md").read_text()
+    example = text[text.index("## Try it on one machine") : text.index("## 1. Install")]
+    monkeypatch.chdir(tmp_path)
+    for line in example.splitlines():
+        if line.startswith(("fedguide deploy certificates", "fedguide deploy key")):
+            assert fedguide(line.split()[1:]) == 0
+    server, client = re.findall(r"^```yaml\n(.*?)^```", example, re.MULTILINE | re.DOTALL)
+    other = client.replace("client: 0", "client: 1").replace("client_0", "client_1").replace("site_0", "site_1")
+    for name, content in {"server": server, "client_0": client, "client_1": other}.items():
+        (tmp_path / f"{name}.yml").write_text(content)
+    assert sorted(ServerDeployment(tmp_path / "server.yml").keys.values()) == [0, 1]
+    for k in (0, 1):
+        deployment = ClientDeployment(tmp_path / f"client_{k}.yml")
+        read_site_config(deployment.site)
+        assert (deployment.site["client"], deployment.folder.name) == (k, f"site_{k}")

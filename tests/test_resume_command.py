@@ -84,7 +84,7 @@ def results(folder: Path) -> dict:
 def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    events = EventAccumulator(str(folder / "tb"))
+    events = EventAccumulator(str(folder))
     events.Reload()
     return {
         tag: [(event.step, event.value) for event in events.Scalars(tag)]

@@ -64,8 +64,8 @@ def train_parser(prog: str) -> OneLineParser:
          "pretraining.dice_updates:1000")  # fmt: skip
     flag("--seed", type=int, default=0, help="of the whole federation; negative: drawn at random")
     flag("-f", "--log-folder", default="logs", metavar="DIR", help="runs are written to DIR/ALGO/FAMILY_<number>")
-    flag("-tb", "--tensorboard-log", metavar="DIR", help="TensorBoard events to DIR/FAMILY/ALGO_<number>; by default to tb "
-         "in the run's folder")  # fmt: skip
+    flag("-tb", "--tensorboard-log", metavar="DIR", help="TensorBoard events to DIR/FAMILY/ALGO_<number>; by default to "
+         "the run's folder")  # fmt: skip
     flag("--track", choices=TRACKERS, help="log to trackio or Weights & Biases as well, with TensorBoard's keys")
     flag("--track-project", metavar="NAME", help=f"project there; by default {TRACK_PROJECT}")
     flag("--cache-dir", metavar="DIR", help="where results of the offline stage are kept; by default $FEDGUIDE_CACHE or "

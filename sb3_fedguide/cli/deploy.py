@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 #: In a deployment's folder, what its processes are told.
 CONFIG = "config.json"
+#: How little Flower and gRPC say in the journal, unless the user's environment says otherwise; read when they are imported.
+QUIET = {"FLWR_LOG_LEVEL": "WARNING", "GRPC_VERBOSITY": "ERROR"}
 
 
 @pipe_may_close
@@ -33,6 +35,8 @@ def main(argv: Sequence[str]) -> int:
         (SIGINT), 143 after SIGTERM
     """
     arguments = _parser().parse_args(argv)
+    for name, level in QUIET.items():
+        os.environ.setdefault(name, level)
     signals = StopSignals()
     try:
         _check_installation()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.cli.arguments import OneLineParser
 from sb3_fedguide.cli.output import pipe_may_close
+from sb3_fedguide.cli.pretrained import find_run
 from sb3_fedguide.cli.rendering import check_rendering
 from sb3_fedguide.cli.saved_run import in_place, load_model, read_run
 from sb3_fedguide.cli.video import FORMATS, check_format, write_videos
@@ -36,6 +37,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide evaluate") -> 
     try:
         import_packages(arguments.gym_packages)
         _check(arguments)
+        arguments.run = str(find_run(arguments.run))
         run, config, family = _read_run(arguments)
         model = load_model(Path(arguments.run), config, family)
         policies = _policies(arguments, Path(arguments.run), model)
@@ -49,10 +51,11 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide evaluate") -> 
         print(text)
     else:
         from sb3_fedguide.cli.run_folder import write_text
+        from sb3_fedguide.common.digits import shown
 
         write_text(Path(arguments.output), text + "\n")
         for name, values in result["policies"].items():
-            print(f"{name}: average {values['average']:.2f}, worst client {values['worst_client']:.2f}")
+            print(f"{name}: average {shown(values['average'])}, worst client {shown(values['worst_client'])}")
     return 0
 
 
@@ -61,7 +64,8 @@ def _parser(prog: str) -> OneLineParser:
 
     parser = OneLineParser(prog=prog, description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     flag = parser.add_argument
-    flag("run", metavar="RUN", help="folder of a run, e.g. logs/fedguide/HopperHard_1")
+    flag("run", metavar="RUN", help="folder of a run, e.g. logs/fedguide/HopperHard_1, or the name of one "
+         "that comes with the package, e.g. Bandit2D")  # fmt: skip
     flag("--policy", choices=("deployed", "broadcast", "both"), default="both", help="the clients' own policies as they left "
          "local training, what the server sent after it, or both where they differ")  # fmt: skip
     flag("--episodes", type=int, default=10, metavar="N", help="episodes per client")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_fedguide.cli.arguments import OneLineParser
+from sb3_fedguide.cli.pretrained import PRETRAINED, find_run
 from sb3_fedguide.cli.run_folder import PARAMETERS, read_deployed
 
 if TYPE_CHECKING:
@@ -49,12 +50,13 @@ def _parser(prog: str) -> OneLineParser:
 def _export(arguments: argparse.Namespace) -> Iterator[Path]:
     from sb3_fedguide.common.export import write_policy
 
-    file = _parameter_file(arguments.folder)
+    file = _parameter_file(find_run(arguments.folder))
     policies = _policies(file, arguments.policy)
     clients = list(policies) if arguments.clients is None else arguments.clients
     if unknown := [client for client in clients if client not in policies]:
         raise ValueError(f"--clients: there is no client {unknown[0]} in {file}; it has {', '.join(map(str, policies))}")
-    folder = file.parent / "policies" if arguments.output is None else arguments.output
+    beside = Path() if file.is_relative_to(PRETRAINED) else file.parent
+    folder = beside / "policies" if arguments.output is None else arguments.output
     for client in clients:
         for name in arguments.format:
             path = folder / f"client_{client}{SUFFIXES[name]}"

@@ -13,6 +13,8 @@ USAGE = """usage: fedguide COMMAND ...
   train      train a federation (the same as train.py)
   evaluate   evaluate a finished run's policies, client by client
   export     clients' policies for use elsewhere: Stable-Baselines3, TorchScript, torch.export, ONNX
+  push       a run to the Hugging Face hub, without pickle, with a model card
+  pull       a run from there, checked
   benchmark  methods on families with seeds, as runs that can be interrupted, and tables of their results
   plot       figures of a benchmark's results or of runs: learning curves, bars, clients, aggregates, speed-up
   tune       search for an algorithm's hyperparameters with Optuna
@@ -39,6 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "train": _train,
         "evaluate": _evaluate,
         "export": _export,
+        "push": _push,
+        "pull": _pull,
         "benchmark": _benchmark,
         "plot": _plot,
         "tune": _tune,
@@ -67,6 +71,18 @@ def _evaluate(argv: Sequence[str]) -> int:
 
 def _export(argv: Sequence[str]) -> int:
     from sb3_fedguide.cli.export import main
+
+    return main(argv)
+
+
+def _push(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.push import main
+
+    return main(argv)
+
+
+def _pull(argv: Sequence[str]) -> int:
+    from sb3_fedguide.cli.pull import main
 
     return main(argv)
 

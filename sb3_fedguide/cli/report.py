@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from sb3_fedguide.common.digits import decimals
+
 if TYPE_CHECKING:
     from sb3_fedguide.cli.recorder import CostCallback, RunEvalCallback
     from sb3_fedguide.common.federation import Federation
@@ -70,17 +72,18 @@ def print_summary(summary: dict[str, Any], folder: str) -> None:
     policies = [policy for policy in ("deployed", "broadcast") if policy in summary]
     rounds = f"{summary['rounds_done']} of {summary['n_rounds']} rounds"
     table = Table(title=f"{summary['algo']} on {summary['env']}, seed {summary['seed']}, {rounds}", title_justify="left")
+    places = decimals(value for policy in policies for value in summary[policy]["client_returns"])
     table.add_column("client", justify="right")
     for policy in policies:
         table.add_column(f"{policy} return", justify="right")
     table.add_column("episode length", justify="right")
     for index, client in enumerate(summary["clients"] if policies else []):
-        values = [f"{summary[policy]['client_returns'][index]:.2f}" for policy in policies]
+        values = [f"{summary[policy]['client_returns'][index]:.{places}f}" for policy in policies]
         table.add_row(str(client), *values, f"{summary[policies[0]]['client_lengths'][index]:.0f}")
     if policies:
         table.add_section()
-        table.add_row("[bold]average", *[f"[bold]{summary[policy]['average']:.2f}" for policy in policies], "")
-        table.add_row("worst", *[f"{summary[policy]['worst_client']:.2f}" for policy in policies], "")
+        table.add_row("[bold]average", *[f"[bold]{summary[policy]['average']:.{places}f}" for policy in policies], "")
+        table.add_row("worst", *[f"{summary[policy]['worst_client']:.{places}f}" for policy in policies], "")
         console.print(table)
     else:
         console.print(f"{table.title}; no evaluation")

@@ -129,10 +129,13 @@ class Run:
                                          "n_timesteps": self.arguments.n_timesteps})  # fmt: skip
 
     def _set_logger(self, folder: Path) -> None:
-        from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
+        from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
+
+        from sb3_fedguide.cli.round_table import RoundTable
 
         arguments = self.arguments
-        events = folder / "tb"
+        # TensorBoard calls a run by the folder of its events, so they lie in the run's own; an earlier version's go on in tb
+        events = folder / "tb" if (folder / "tb").is_dir() else folder
         if arguments.tensorboard_log is not None:
             number = folder.name.rsplit("_", 1)[-1]
             events = Path(arguments.tensorboard_log) / self.family.name / f"{arguments.algo}_{number}"
@@ -145,7 +148,7 @@ class Run:
         if self._tracker is not None:
             outputs.append(self._tracker)
         if loud:
-            outputs.append(HumanOutputFormat(sys.stdout))
+            outputs.append(RoundTable(sys.stdout))
         self.model.set_logger(Logger(str(events), outputs))
 
     def _make_tracker(self, folder: Path) -> TrackerOutputFormat | None:

@@ -63,7 +63,9 @@ def parameter_file(trained: str) -> Path:
 
     :raises ValueError: if there is none
     """
-    path = Path(trained).absolute()
+    from sb3_fedguide.cli.pretrained import find_run, no_such_run
+
+    path = find_run(trained).absolute()
     path = path / PARAMETERS if path.is_dir() else path
     if path.suffix == ".zip":
         raise ValueError(
@@ -71,7 +73,8 @@ def parameter_file(trained: str) -> Path:
             f"{PARAMETERS} beside it (in Python, export_parameters() of the loaded model writes one)"
         )
     if not path.is_file():
-        raise ValueError(f"-i {trained}: there is no {path}; give the folder of a trained run, or its {PARAMETERS}")
+        hint = "" if Path(trained).exists() else no_such_run(trained)
+        raise ValueError(f"-i {trained}: there is no {path}; give the folder of a trained run, or its {PARAMETERS}{hint}")
     return path
 
 
@@ -126,9 +129,9 @@ def read_deployed(folder: Path) -> dict[str, np.ndarray]:
 
     :raises ValueError: if the file is damaged
     """
-    from sb3_fedguide.state.array_files import load_arrays
+    from sb3_fedguide.state.array_files import read_arrays
 
-    return load_arrays(folder / DEPLOYED) if (folder / DEPLOYED).is_file() else {}
+    return read_arrays(folder / DEPLOYED) if (folder / DEPLOYED).is_file() else {}
 
 
 def versions() -> dict[str, str]:

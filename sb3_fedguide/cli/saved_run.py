@@ -41,9 +41,12 @@ def read_run(folder: Path) -> tuple[dict[str, Any], Config, Family]:
 
 
 def _remedy(folder: Path, missing: str) -> str:
-    """What to do about a deployed client's folder, and about the runs of earlier versions, which kept SB3's archive only."""
+    """What to do: about no folder, a deployed client's, and runs of earlier versions, which kept SB3's archive only."""
+    from sb3_fedguide.cli.pretrained import no_such_run
     from sb3_fedguide.deployment.site import PARAMETERS, SITE
 
+    if not folder.exists():
+        return no_such_run(folder)
     if missing == "summary.json" and any((place / PARAMETERS).is_file() for place in (folder, folder / SITE)):
         return "; it is a deployed client's, of whose policy 'fedguide export' makes an ordinary one to evaluate"
     if missing != "parameters.npz" or not (folder / "model.zip").is_file():

@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList, Event
 from tqdm.auto import tqdm
 
 from fed_envs.state import State, declared_state, load_declared
+from sb3_fedguide.common.digits import shown
 from sb3_fedguide.server.rounds import Rounds
 
 if TYPE_CHECKING:
@@ -165,7 +166,10 @@ class ExchangeCallback(RoundCallback):
 
 
 class RoundProgressCallback(RoundCallback):
-    """A progress bar over all rounds of a run with the current client-average return of finished training episodes."""
+    """A progress bar over all rounds of a run with the client-average return of finished training episodes.
+
+    Their actions are sampled: evaluations, which are deterministic, return something else.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -178,7 +182,8 @@ class RoundProgressCallback(RoundCallback):
         self.bar = tqdm(total=total, initial=done, desc=type(self.model).__name__, unit="round", dynamic_ncols=True)
 
     def _on_round_end(self) -> None:
-        self.bar.set_postfix({"return": f"{self.model.mean_episode_return():.1f}"}, refresh=False)
+        told = shown(self.model.mean_episode_return())
+        self.bar.set_postfix_str(f"training return {told}, sampled actions", refresh=False)
         self.bar.update()
 
     def _on_training_end(self) -> None:

@@ -20,9 +20,13 @@ from sb3_fedguide.deployment.flower.certificates import LOOPBACK
 #: The deployment uses what is no public interface of Flower, and is tested with these releases only.
 FLOWER = "1.41."
 _GRACE_SECONDS = 10.0
+#: Uvicorn, inside the SuperNode, says of itself what Flower's level keeps back.
 _START = """
-import sys
+import os, sys
+from uvicorn.config import LOGGING_CONFIG
 from flwr.supercore.app_utils import start_parent_process_monitor
+for logger in LOGGING_CONFIG["loggers"].values():
+    logger["level"] = os.environ.get("FLWR_LOG_LEVEL", "WARNING").upper()
 start_parent_process_monitor(int(sys.argv.pop(1)))
 from {module} import {function}
 sys.argv[0] = "{function}"

@@ -32,9 +32,7 @@ def main(grid: Grid, context: Context) -> None:
 
     :raises SystemExit: with code 2 where the configuration or the folder is wrong, 1 where there were too few clients
     """
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", force=True)
-    logging.getLogger("httpx").setLevel(logging.WARNING)  # it has a line for every request
-    logging.getLogger("flwr").propagate = False  # it writes to the terminal itself
+    set_up_journal()
     told = json.loads(Path(os.environ[CONFIG]).read_text(encoding="utf-8"))
     clients = {read_public_key(text): int(client) for client, text in told["clients"].items()}
     log = RoundLog(Path(told["folder"]) / "tb")
@@ -48,6 +46,13 @@ def main(grid: Grid, context: Context) -> None:
         sys.exit(EXIT_USAGE)
     finally:
         log.close()
+
+
+def set_up_journal() -> None:
+    """Lines of this package with their time, and of other packages what is wrong and nothing else."""
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(message)s", force=True)
+    logging.getLogger("sb3_fedguide").setLevel(logging.INFO)
+    logging.getLogger("flwr").propagate = False  # it writes to the terminal itself
 
 
 class RoundLog:
