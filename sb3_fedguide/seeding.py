@@ -31,3 +31,4 @@ class Role(IntEnum):
     PARTICIPATION = 12
     DELAY = 13
     SCREENING = 14
+    UPLOAD_NOISE = 15

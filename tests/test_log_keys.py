@@ -27,7 +27,7 @@ GUIDED = {**PPO, "pretraining": OFFLINE}
 #: algorithm to constructor arguments: every option that logs a key of its own is on somewhere
 SETTINGS: dict[str, list[dict]] = {
     "local": [PPO],
-    "fedavg": [{**PPO, "clip_range_vf": 0.2}],
+    "fedavg": [{**PPO, "clip_range_vf": 0.2, "noise_multiplier": 0.01, "clipping_norm": 1.0}],
     "fedprox": [PPO],
     "fedkl": [PPO],
     "fedsvrpgm": [PPO],

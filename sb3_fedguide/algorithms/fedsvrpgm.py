@@ -81,6 +81,11 @@ class FedSVRPGM(FedAvg):
         payload.update({DIRECTION + name: array[index].copy() for name, array in self.directions.items()})
         return payload
 
+    def public_parameters(self) -> Parameters:
+        directions = snapshot(self.policy, ACTOR_PREFIXES)
+        zeros = {DIRECTION + name: np.zeros_like(array) for name, array in directions.items()}
+        return {**super().public_parameters(), **zeros}
+
     def receive(self, index: int, broadcast: Payload) -> None:
         super().receive(index, {name: array for name, array in broadcast.items() if not name.startswith(DIRECTION)})
         for name, array in broadcast.items():

@@ -50,6 +50,8 @@ def summarize(
             "median_round": statistics.median(costs.round_seconds) if costs.round_seconds else None,
         },
     }
+    if privacy := model.upload_summary():
+        result["privacy"] = privacy
     if model.delays is not None:
         result |= {"delays": str(model.delays.settings), "simulated_seconds": model.delays.seconds}
     for policy in evaluated:
@@ -100,7 +102,18 @@ def print_summary(summary: dict[str, Any], folder: str) -> None:
     if summary["rejected_uploads"]:
         counts = ", ".join(f"client {client} {number}" for client, number in summary["rejected_uploads"].items())
         console.print(f"rejected uploads: {counts}", highlight=False)
+    if privacy := summary.get("privacy"):
+        console.print(describe_privacy(privacy), highlight=False)
     console.print(f"folder {folder}", highlight=False, soft_wrap=True)
+
+
+def describe_privacy(privacy: dict[str, Any]) -> str:
+    """What the uploads of a run have spent, in a line."""
+    clipping = f"{privacy['clipped']:.0%} clipped to {privacy['clipping_norm']:g}"
+    if "epsilon" not in privacy:
+        return f"privacy none: uploads without noise, {clipping}"
+    most = max(privacy["uploads"].values())
+    return f"privacy epsilon {privacy['epsilon']:.3g} at delta {privacy['delta']:g} after {most} uploads, {clipping}"
 
 
 def format_size(n_bytes: float) -> str:

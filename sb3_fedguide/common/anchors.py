@@ -13,7 +13,7 @@ from sb3_fedguide.common.ppo_policy import StackedActor, StackedMlpPolicy
 Parameters = dict[str, np.ndarray]
 
 
-def snapshot(policy: StackedMlpPolicy, prefixes: tuple[str, ...]) -> Parameters:
+def snapshot(policy: th.nn.Module, prefixes: tuple[str, ...]) -> Parameters:
     """Copies of the parameters whose names begin with one of ``prefixes``."""
     named = policy.named_parameters()
     return {name: parameter.detach().cpu().numpy().copy() for name, parameter in named if name.startswith(prefixes)}

@@ -156,7 +156,7 @@ class ExchangeCallback(RoundCallback):
         for complaint in self.server.complaints:
             warnings.warn(f"round {model.round}: {complaint}", stacklevel=1)
         self._remember_outdated()
-        for key, value in self.server.figures.items():
+        for key, value in {**self.server.figures, **model.upload_figures()}.items():
             self.logger.record(key, value)
         self.logger.record("time/exchange", time.perf_counter() - started)
 

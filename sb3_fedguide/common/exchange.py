@@ -75,6 +75,25 @@ class Exchange(BaseAlgorithm):
         """All that the client at position ``index`` sends: :meth:`upload`, and its round's moments where they are shared."""
         return {**self.upload(index), **self.normalizer.round_moments(index)}
 
+    @property
+    def protects_uploads(self) -> bool:
+        """Whether what a client uploads has noise, so that nothing else of it may leave the client."""
+        return False
+
+    def upload_figures(self, public: bool = False) -> dict[str, float]:
+        """What is to be logged of this round's uploads, by log key.
+
+        :param public: only what tells nothing of them
+        """
+        return {}
+
+    def upload_summary(self) -> dict[str, Any]:
+        """What is to be said of all uploads at the end of a run, as plain data; nothing where there is nothing to say."""
+        return {}
+
+    def draw_secret_keys(self) -> None:
+        """Let the noise of uploads be unknown to whoever knows the seed; called where a client is on a machine of its own."""
+
     def test_work(self) -> np.ndarray | None:
         """Environment steps of each client's tests since it was last asked, in rounds, ``(n_clients,)``; ``None`` for none."""
         return None

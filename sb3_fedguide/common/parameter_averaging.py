@@ -8,9 +8,11 @@ from typing import Any, ClassVar, Literal, Unpack
 import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
 
+from sb3_fedguide.common.anchors import Parameters, snapshot
 from sb3_fedguide.common.arguments import LearnerArguments
 from sb3_fedguide.common.federation import Federation, FederationLike
 from sb3_fedguide.common.screening import Screening, check_screening
+from sb3_fedguide.common.upload_privacy import UploadPrivacy
 from sb3_fedguide.server.averaging import (
     Aggregator,
     averaged_prefixes,
@@ -38,12 +40,17 @@ class ParameterAveraging(Federation):
         ``until_0.4`` takes all for two fifths of the run and nothing after it, so that everybody ends with a policy of its own
     :param screening: share of its environment steps that a client may spend on tests of what the server sends against its own
         policy, see :class:`~sb3_fedguide.common.screening.Screening`; with 0 it takes it untested
+    :param noise_multiplier: standard deviation of the Gaussian noise that each client adds to every number that it uploads, in
+        units of ``clipping_norm``; 0 for none
+    :param clipping_norm: L2 norm to which each client clips its update before it uploads it, see
+        :class:`~sb3_fedguide.common.upload_privacy.UploadPrivacy`; ``None`` for no clipping
+    :param delta: for which the log's epsilon holds; it changes nothing else
     :raises ValueError: for values out of range
 
     All other parameters are those of the learner, :class:`FederatedPPO` or :class:`FederatedDDPG`.
     """
 
-    state_attributes: ClassVar[tuple[str, ...]] = ("screening_state",)
+    state_attributes: ClassVar[tuple[str, ...]] = ("screening_state", "privacy_state", "known_parameters")
 
     def __init__(
         self,
@@ -58,6 +65,9 @@ class ParameterAveraging(Federation):
         server_momentum: float = 0.0,
         mix: float | Schedule = 1.0,
         screening: float = 0.0,
+        noise_multiplier: float = 0.0,
+        clipping_norm: float | None = None,
+        delta: float = 1e-5,
         **learner: Unpack[LearnerArguments],
     ) -> None:
         check_averaging(average, average_every)
@@ -77,8 +87,31 @@ class ParameterAveraging(Federation):
         #: see :attr:`Screening.state`; empty until the first test or without tests
         self.screening_state: dict[str, np.ndarray] = {}
         self._tests = Screening(self)
+        self.noise_multiplier = noise_multiplier
+        self.clipping_norm = clipping_norm
+        self.delta = delta
+        #: see :meth:`UploadPrivacy.begin`; empty without
+        self.privacy_state: dict[str, np.ndarray] = {}
+        #: what the server knows of what each client uploads, ``(n_clients, ...)`` each; empty without clipping
+        self.known_parameters: Parameters = {}
+        self._privacy = UploadPrivacy(self)
         self._shares: dict[int, float] = {}
         super().__init__(policy, env, **learner)  # type: ignore[arg-type, misc]
+
+    def _setup_model(self) -> None:
+        super()._setup_model()  # type: ignore[safe-super]  # the learner's
+        self._privacy.check()
+        if self._privacy.is_on:
+            self._privacy.begin()
+
+    def _identity(self) -> dict[str, Any]:
+        privacy = {"noise_multiplier": self.noise_multiplier, "clipping_norm": self.clipping_norm}
+        return {**super()._identity(), **(privacy if self._privacy.is_on else {})}  # what was spent is counted in these
+
+    def public_parameters(self) -> Parameters:
+        """What everybody knows of what each client uploads, before anything was exchanged: the policies that come of the
+        federation's seed alone. Called while they have not yet changed; ``(n_clients, ...)`` each."""
+        return snapshot(self.policy, self.averaged_prefixes)
 
     @property
     def averaged_prefixes(self) -> tuple[str, ...]:
@@ -87,15 +120,33 @@ class ParameterAveraging(Federation):
 
     def sends_policy(self, round: int) -> bool:
         due = averaging_is_due(round, self.average_every, self.average_until)
-        return self.average != "critic" and due and self._mix() > 0
+        return self.average != "critic" and due and self.mix_now() > 0
 
     def upload(self, index: int) -> Payload:
         payload = super().upload(index)
         if not averaging_is_due(self.round, self.average_every, self.average_until):
             return payload
-        if self._tests.is_alone(index) or self._mix() == 0:  # nothing of it is to move the others
+        if self._tests.is_alone(index) or self.mix_now() == 0:  # nothing of it is to move the others
             return {**payload, N_SAMPLES: np.array(0, dtype=np.float32)}
         return {**payload, **self._policy_upload(index)}
+
+    @property
+    def protects_uploads(self) -> bool:
+        return self._privacy.has_noise
+
+    def upload_figures(self, public: bool = False) -> dict[str, float]:
+        return self._privacy.figures(public) if self._privacy.is_on else {}
+
+    def upload_summary(self) -> dict[str, Any]:
+        return self._privacy.summary() if self._privacy.is_on else {}
+
+    def draw_secret_keys(self) -> None:
+        if self.protects_uploads:
+            self._privacy.draw_secret_keys()
+
+    def outgoing(self, index: int) -> Payload:
+        payload = super().outgoing(index)
+        return self._privacy.protect(index, payload) if self._privacy.is_on else payload
 
     def upload_shapes(self) -> dict[str, list[int]]:
         policy = {name: list(array.shape) for name, array in self._policy_upload(0).items()}
@@ -116,7 +167,7 @@ class ParameterAveraging(Federation):
             if name.startswith(self.averaged_prefixes)
         }
 
-    def _mix(self) -> float:
+    def mix_now(self) -> float:
         """The share that clients take now, in [0, 1]."""
         return min(1.0, max(0.0, self.mix(self._current_progress_remaining))) if callable(self.mix) else self.mix
 
@@ -134,11 +185,13 @@ class ParameterAveraging(Federation):
         return work
 
     def take_broadcasts(self, broadcasts: Mapping[int, Payload]) -> None:
-        mix = self._mix()
+        mix = self.mix_now()
         # who has nothing of its own, or nothing to do with what the others have, takes all or nothing
         self._shares = {
             index: 1.0 if self._tests.is_alone(index) or not self.has_trained[index] else mix for index in broadcasts
         }
+        if self._privacy.is_on:
+            self._privacy.receive(broadcasts)
         super().take_broadcasts(broadcasts)
 
     def _accepted(self, broadcasts: Mapping[int, Payload]) -> Mapping[int, Payload]:
@@ -168,4 +221,4 @@ class ParameterAveraging(Federation):
         return {name: ((1 - share) * own[name] + share * array).astype(np.float32) for name, array in average.items()}
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_tests", "_shares"]
+        return [*super()._excluded_save_params(), "_tests", "_shares", "_privacy"]

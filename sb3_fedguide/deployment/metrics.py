@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_fedguide.server.payload import EPSILON
+
 #: Columns of the table of evaluations, the same in process and over a network.
 EVALUATION_COLUMNS = (
     "round", "timesteps", "policy", "client", "mean_return", "std_return", "mean_length", "success_rate",
@@ -86,7 +88,8 @@ def count_tests(facts: Mapping[int, Mapping[str, Any]], counted: dict[int, int])
 
 
 def merge_figures(facts: Mapping[int, Mapping[str, Any]]) -> dict[str, float]:
-    """One log of all clients': ``client_<k>/...`` is taken from client k, everything else averaged over those that say it.
+    """One log of all clients': ``client_<k>/...`` is taken from client k, everything else averaged over those that say it,
+    but for :data:`~sb3_fedguide.server.payload.EPSILON`, the largest.
 
     Keys of evaluations are left out: :func:`evaluation_figures` makes them of the episodes.
     """
@@ -107,7 +110,7 @@ def merge_figures(facts: Mapping[int, Mapping[str, Any]]) -> dict[str, float]:
                 merged[key] = number
             elif not key.startswith(("client_", "federated/", "eval/")):
                 shared.setdefault(key, []).append(number)
-    return {**{key: float(np.mean(values)) for key, values in shared.items()}, **merged}
+    return {**{key: float(np.max(values) if key == EPSILON else np.mean(values)) for key, values in shared.items()}, **merged}
 
 
 def evaluation_figures(evaluations: Iterable[ClientEvaluation]) -> dict[str, float]:

@@ -51,7 +51,8 @@ class Site:
         ``None`` for none
     :param n_episodes: episodes of an evaluation
     :param report: tell the server the round's log and the evaluations' returns; otherwise nothing but uploads leaves
-    :raises ValueError: for a model of several clients, or a folder with another client's or another run's state
+    :raises ValueError: for a model of several clients, for a report beside uploads with noise, or a folder with another
+        client's or another run's state
     """
 
     def __init__(
@@ -72,9 +73,15 @@ class Site:
             raise ValueError(
                 f"{type(model).__name__} has all clients' data in one place and cannot be deployed to their machines"
             )
+        if report and model.protects_uploads:
+            raise ValueError(
+                "noise_multiplier protects what a client uploads, and its report (the round's log, the evaluations' returns) "
+                "would go to the server without noise; set report: false"
+            )
         self.model, self.n_rounds, self.folder = model, n_rounds, Path(folder)
         self.client_id = model.client_ids[0]
         model.strategy = None  # it is on the server
+        model.draw_secret_keys()
         self._log = _LastLog()
         model.set_logger(Logger(None, [self._log]))
         self._report = report
@@ -203,11 +210,14 @@ class Site:
             model.play_round(callbacks, hooks, log_interval=1)
         if self._evaluation is not None and self._evaluation.is_due(message.round):
             evaluations.append(self._evaluated("deployed", message.round))
-        return model.outgoing(0), {
-            "figures": self._log.figures if self._report else {},
-            "evaluations": evaluations,
-            **({"test_steps": self.model.test_steps} if self.model.test_steps else {}),
-        }
+        payload = model.outgoing(0)
+        figures = model.upload_figures(public=model.protects_uploads)
+        if self._report:
+            figures = {**self._log.figures, **figures}
+        facts: dict[str, Any] = {"figures": figures, "evaluations": evaluations}
+        if model.test_steps and not model.protects_uploads:
+            facts["test_steps"] = model.test_steps
+        return payload, facts
 
     def _finish(self, message: Message) -> Answer:
         evaluations = self._receive(message)

@@ -62,7 +62,9 @@ _OF_AVERAGING = {
     "average_every": 1, "average_until": None, "aggregator": "mean", "trim_fraction": 0.25, "server_step": 1.0,
     "server_momentum": 0.0,
 }  # fmt: skip
-_AVERAGING = {"average": "all", **_OF_AVERAGING}
+#: What clients do to their uploads is the server's business as far as all have to do the same.
+_OF_UPLOADS = {"noise_multiplier": 0.0, "clipping_norm": None}
+_AVERAGING = {"average": "all", **_OF_AVERAGING, **_OF_UPLOADS}
 _EXPERTS = {"n_experts": None, "eta": 0.05, "cost": "score", "cost_scaling": "max"}
 
 #: The methods' servers; :data:`sb3_fedguide.registry.ALGORITHMS` says whose is which.

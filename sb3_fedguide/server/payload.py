@@ -10,6 +10,9 @@ Payload = dict[str, np.ndarray]
 #: Key of an upload's number of samples, the weight of its client in averages.
 N_SAMPLES = "n_samples"
 
+#: Log key of what the client has spent that uploaded most: over clients its largest value counts, and not the average.
+EPSILON = "privacy/epsilon"
+
 #: Moments of a client's observations, float64: those of its last round up, those of all clients since the beginning down.
 OBSERVATIONS = "observations."
 OBSERVATION_COUNT, OBSERVATION_MEAN, OBSERVATION_VAR = (f"{OBSERVATIONS}{name}" for name in ("count", "mean", "var"))

@@ -1,0 +1,196 @@
+"""Differential privacy of what a client uploads: its change is clipped and gets noise before it leaves the client."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_fedguide.common.privacy_accountant import check_accountant, epsilon
+from sb3_fedguide.seeding import Role, seed_sequence
+from sb3_fedguide.server.payload import EPSILON, N_SAMPLES, OBSERVATIONS, Payload
+
+if TYPE_CHECKING:
+    from sb3_fedguide.common.parameter_averaging import ParameterAveraging
+
+
+class UploadPrivacy:
+    """Each client's clipping and noise, and what it has spent.
+
+    With ``d`` the difference of all that a client uploads to what the server knows of it already, ``d`` as one vector, it
+    uploads
+
+    ``known + d * min(1, clipping_norm / |d|) + N(0, (noise_multiplier * clipping_norm)^2)``.
+
+    The server knows what it last sent to the client, and before that the policy that the federation's seed gives everybody.
+    The client adds the noise, so that neither the server nor who reads the transport ever sees an update without it. It
+    follows from the update and the client's key alone (:func:`gaussian_noise`): a run that goes on from a checkpoint uploads
+    the same again, and no two updates ever get the same noise. In one process the key comes of the federation's seed; a client
+    on its own machine draws one that nobody else knows. A client that has left what the others share (``screening``) uploads a
+    difference of zero, with noise: nobody sees that it has left.
+
+    The idea is that of McMahan et al. (2018), with the noise at the client and not at the server.
+    """
+
+    def __init__(self, model: ParameterAveraging) -> None:
+        self.model = model
+
+    @property
+    def is_on(self) -> bool:
+        """Whether uploads are clipped or get noise."""
+        return self.model.clipping_norm is not None
+
+    @property
+    def has_noise(self) -> bool:
+        return self.model.noise_multiplier > 0
+
+    def check(self) -> None:
+        """:raises ValueError: for noise without a norm that it is measured by or without the accountant, and where something
+        would leave the client that it does not protect"""
+        model = self.model
+        if not self.has_noise:
+            return
+        if not self.is_on:
+            raise ValueError(
+                f"noise_multiplier={model.noise_multiplier} is in units of clipping_norm, and there is none: give one, "
+                "such as the update norm that the log has without noise (privacy/update_norm)"
+            )
+        check_accountant()
+        if model.normalize == "shared":
+            raise ValueError(
+                "noise_multiplier protects uploads of parameters, and normalize='shared' uploads exact observation "
+                "statistics; use normalize=True, whose statistics stay with their client, or False"
+            )
+        if other := sorted(model.upload_shapes().keys() - model.public_parameters().keys() - {N_SAMPLES}):
+            raise ValueError(
+                f"noise_multiplier protects uploads of parameters, and {type(model).__name__} uploads {', '.join(other)} as "
+                "well; use FedAvg, FedProx, FedKL, FedSVRPGM, FedRL or FedGuideR"
+            )
+
+    def begin(self) -> dict[str, np.ndarray]:
+        """Per client, ``(n_clients,)``: uploads so far that were clipped or got noise, and of them those that were longer than
+        ``clipping_norm``; the round of the last one, and the norm of its update; and the key, ``(n_clients, 8)``."""
+        model, state = self.model, self.model.privacy_state
+        if not state:
+            n_clients = model.n_clients
+            state["uploads"] = np.zeros(n_clients, dtype=int)
+            state["clipped"] = np.zeros(n_clients, dtype=int)
+            state["round"] = np.full(n_clients, -1)
+            state["norm"] = np.zeros(n_clients)
+            assert model.seed is not None
+            keys = [seed_sequence(model.seed, Role.UPLOAD_NOISE, client).generate_state(8) for client in model.client_ids]
+            state["key"] = np.array(keys, dtype=np.uint32).reshape(n_clients, 8)
+            model.known_parameters = model.public_parameters()
+        return state
+
+    def draw_secret_keys(self) -> None:
+        """Forget the keys that whoever knows the federation's seed knows."""
+        keys = self.begin()["key"]
+        keys[:] = np.frombuffer(secrets.token_bytes(keys.nbytes), dtype=np.uint32).reshape(keys.shape)
+
+    def receive(self, broadcasts: Mapping[int, Payload]) -> None:
+        """Note what the server knows, by the client's position."""
+        self.begin()
+        known = self.model.known_parameters
+        for index, broadcast in broadcasts.items():
+            for name in broadcast.keys() & known.keys():
+                known[name][index] = broadcast[name]
+
+    def protect(self, index: int, payload: Payload) -> Payload:
+        """What the client at position ``index`` sends instead of ``payload``.
+
+        :raises ValueError: for an array of which it is not known what the server knows of it
+        """
+        model = self.model
+        if self.has_noise and N_SAMPLES not in payload:  # nothing is averaged now
+            return {}
+        if N_SAMPLES not in payload or (not payload[N_SAMPLES] and not self.has_noise):
+            return payload
+        apart = (N_SAMPLES,) if self.has_noise else (N_SAMPLES, OBSERVATIONS)
+        values = {name: array for name, array in payload.items() if not name.startswith(apart)}
+        known = {name: array[index] for name, array in model.known_parameters.items()}
+        if unprotected := sorted(values.keys() - known.keys()):
+            raise ValueError(f"noise_multiplier and clipping_norm do not protect {', '.join(unprotected)}, which it uploads")
+        n_samples = payload[N_SAMPLES]
+        if not n_samples:
+            if model.mix_now() == 0:  # as for everybody
+                return {N_SAMPLES: n_samples}
+            values, n_samples = known, np.array(model.rollout_size, dtype=np.float32)
+        return {**payload, **self._privatized(index, values, known), N_SAMPLES: n_samples}
+
+    def _privatized(self, index: int, values: Payload, known: Payload) -> Payload:
+        """The arrays ``values`` with their difference to ``known`` clipped and with noise."""
+        model, state = self.model, self.begin()
+        assert model.clipping_norm is not None
+        names = sorted(values)
+        ours, theirs = (
+            np.concatenate([np.ravel(arrays[name]) for name in names]).astype(np.float64) for arrays in (values, known)
+        )
+        norm = float(np.linalg.norm(ours - theirs))
+        vector = ours + (clipping_factor(norm, model.clipping_norm) - 1.0) * (ours - theirs)
+        if self.has_noise:
+            key = state["key"][index].tobytes()
+            content = int(state["uploads"][index]).to_bytes(8, "little") + ours.tobytes() + theirs.tobytes()
+            noise = gaussian_noise(key, content, len(ours))
+            vector += model.noise_multiplier * model.clipping_norm * noise
+        state["uploads"][index] += 1
+        state["clipped"][index] += norm > model.clipping_norm
+        state["round"][index], state["norm"][index] = model.round, norm
+        ends = np.cumsum([np.size(values[name]) for name in names])
+        parts = zip(names, np.split(vector, ends[:-1]), strict=True)
+        return {name: part.astype(np.float32).reshape(np.shape(values[name])) for name, part in parts}
+
+    def figures(self, public: bool) -> dict[str, float]:
+        """This round's uploads, by log key; nothing where there were none.
+
+        :param public: only what tells nothing of the updates
+        """
+        model, state = self.model, self.begin()
+        norms = state["norm"][state["round"] == model.round]
+        if not len(norms):
+            return {}
+        assert model.clipping_norm is not None
+        figures = {"privacy/noise_multiplier": float(model.noise_multiplier)}
+        if self.has_noise:
+            figures[EPSILON] = epsilon(model.noise_multiplier, int(state["uploads"].max()), model.delta)
+        if not public:
+            figures["privacy/update_norm"] = float(np.median(norms))
+            figures["privacy/clipped"] = float(np.mean(norms > model.clipping_norm))
+        return figures
+
+    def summary(self) -> dict[str, Any]:
+        """What was spent in the whole run, for its last page; epsilon is that of the client which uploaded most."""
+        model, state = self.model, self.begin()
+        uploads = state["uploads"]
+        summary = {
+            "noise_multiplier": model.noise_multiplier,
+            "clipping_norm": model.clipping_norm,
+            "uploads": {str(client): int(number) for client, number in zip(model.client_ids, uploads, strict=True)},
+            "clipped": float(state["clipped"].sum() / max(uploads.sum(), 1)),
+        }
+        if not self.has_noise:
+            return summary
+        return {**summary, "epsilon": epsilon(model.noise_multiplier, int(uploads.max()), model.delta), "delta": model.delta}
+
+
+def clipping_factor(norm: float, clipping_norm: float) -> float:
+    """By what an update of L2 norm ``norm`` is multiplied; exactly one where it is not longer than ``clipping_norm``."""
+    return clipping_norm / norm if norm > clipping_norm else 1.0
+
+
+def gaussian_noise(key: bytes, content: bytes, size: int) -> np.ndarray:
+    """``size`` standard normal numbers, float64, that nobody can tell from random ones without the key.
+
+    SHAKE-256 of key and content, by the method of Box and Muller.
+
+    :param key: of fixed length
+    :param content: what the noise is for: others get independent numbers
+    """
+    n_pairs = -(-size // 2)
+    bits = np.frombuffer(hashlib.shake_256(key + content).digest(16 * n_pairs), dtype="<u8")
+    uniform = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53  # in (0, 1)
+    radius, angle = np.sqrt(-2.0 * np.log(uniform[:n_pairs])), 2.0 * np.pi * uniform[n_pairs:]
+    return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])[:size]
