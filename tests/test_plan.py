@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sb3_fedguide.benchmark.figures.plans import draw_plans
+from sb3_fedguide.benchmark.plans import Plans, read_plans
 from sb3_fedguide.cli.main import main
 from sb3_fedguide.common.checkpoint import CheckpointCallback
-from sb3_fedguide.monitoring.plan import PlanCallback, Plans, read_plans
+from sb3_fedguide.monitoring.plan import PlanCallback
 from sb3_fedguide.registry import algorithm
 from sb3_fedguide.server.ot_moe import given_heads, head_shares
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from fed_envs.faults import ClientError
-from sb3_fedguide.deployment.metrics import ClientEvaluation, evaluation_figures, merge_figures, read_evaluations
 from sb3_fedguide.deployment.transport import Message
+from sb3_fedguide.server.metrics import ClientEvaluation, evaluation_figures, merge_figures, read_evaluations
 from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_fault
 from tests.loop_transport import NAME, Client, LoopTransport, run
 

@@ -16,11 +16,11 @@ from scipy.stats import norm
 from sb3_fedguide.cli.train import main
 from sb3_fedguide.common.privacy_accountant import SENSITIVITY, epsilon
 from sb3_fedguide.common.upload_privacy import gaussian_noise
-from sb3_fedguide.deployment.metrics import merge_figures
 from sb3_fedguide.deployment.serve import serve
 from sb3_fedguide.deployment.site import Site
 from sb3_fedguide.registry import algorithm
 from sb3_fedguide.seeding import Role, seed_sequence
+from sb3_fedguide.server.metrics import merge_figures
 from sb3_fedguide.server.payload import N_SAMPLES
 from tests.conftest import assert_same_parameters
 from tests.test_engines import Here

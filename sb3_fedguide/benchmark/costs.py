@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sb3_fedguide.registry import algorithm
-from sb3_fedguide.server.participants import n_participants
+from sb3_fedguide.settings.participants import n_participants
 from sb3_fedguide.settings.pretraining import Piece, PretrainingConfig
 
 #: Microseconds of one client's environment step with its policy, by backbone; and steps of an evaluation episode, at most.

@@ -9,11 +9,11 @@ from sb3_fedguide.benchmark.figures.plans import draw_plans
 from sb3_fedguide.benchmark.figures.rollouts import Cell, Row, draw_rollouts, pixels
 from sb3_fedguide.benchmark.figures.runs import Comparison, Runs
 from sb3_fedguide.benchmark.figures.styles import style
+from sb3_fedguide.benchmark.plans import read_plans
 from sb3_fedguide.benchmark.rollouts import overlay, pictures, pose_steps, record
 from sb3_fedguide.cli.rendering import check_rendering
 from sb3_fedguide.cli.run_folder import PLAN
 from sb3_fedguide.cli.saved_run import in_place, load_model, read_deployed_policies, read_run
-from sb3_fedguide.monitoring.plan import read_plans
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -15,8 +15,8 @@ from fed_envs.files import GrowingTable
 from fed_envs.state import State, freeze, thaw
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.episodes import truth
-from sb3_fedguide.deployment.metrics import EVALUATION_COLUMNS
 from sb3_fedguide.seeding import EVALUATION_SEED, Role
+from sb3_fedguide.server.metrics import EVALUATION_COLUMNS
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation

@@ -15,9 +15,9 @@ from pathlib import Path
 from fed_envs.plain_data import State, freeze, thaw
 from sb3_fedguide.deployment.clients import OF_A_RUN, Clients, difference, server_facts
 from sb3_fedguide.deployment.config import ServerConfig, TooFewClients
-from sb3_fedguide.deployment.metrics import EvaluationTable, count_tests, evaluation_figures, merge_figures, read_evaluations
 from sb3_fedguide.deployment.transport import RUN, UNPREPARED, Failure, Kind, Message, Transport
 from sb3_fedguide.server.build import make_strategy
+from sb3_fedguide.server.metrics import EvaluationTable, count_tests, evaluation_figures, merge_figures, read_evaluations
 from sb3_fedguide.server.payload import Payload
 from sb3_fedguide.server.rounds import Rounds, participants, payload_bytes, rejections
 from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_fault

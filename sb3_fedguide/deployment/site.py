@@ -19,10 +19,10 @@ from sb3_fedguide.common.evaluation import Evaluation, FederatedEvalCallback, ev
 from sb3_fedguide.common.faults import in_round
 from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.deployment.clients import OF_A_RUN, WITH_SERVER, difference
-from sb3_fedguide.deployment.metrics import ClientEvaluation
 from sb3_fedguide.deployment.transport import KINDS, RUN, UNPREPARED, Message
 from sb3_fedguide.offline.trunk import TrunkTraining, observation_moments
 from sb3_fedguide.registry import algorithm_name
+from sb3_fedguide.server.metrics import ClientEvaluation
 from sb3_fedguide.server.payload import Payload
 from sb3_fedguide.server.trunk import MOMENTS, TRUNK
 from sb3_fedguide.state.array_files import take_prefix

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from sb3_fedguide.benchmark.figures.layout import MEDIUM, SMALL, legend, panels
 from sb3_fedguide.benchmark.figures.styles import style
-from sb3_fedguide.monitoring.plan import Plans
+from sb3_fedguide.benchmark.plans import Plans
 
 MAP = "cividis"
 #: Rounds whose plan is drawn.
