@@ -19,8 +19,8 @@ import yaml
 from sb3_fedguide.cli import hub, pull
 from sb3_fedguide.cli.main import main
 from sb3_fedguide.state.array_files import read_arrays, write_arrays
+from tests.crafted_files import crafted_npz
 from tests.fake_hub import COMMIT, TOKEN, FakeHub
-from tests.test_safe_loading import crafted_npz
 
 pytest.importorskip("huggingface_hub")
 

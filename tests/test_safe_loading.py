@@ -27,6 +27,7 @@ from sb3_fedguide.offline.minari_io import check_spaces, find_dataset, read_mina
 from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.state.array_files import load_arrays, read_arrays, write_arrays
 from tests.conftest import others_slow
+from tests.crafted_files import Payload, crafted_npz
 
 OFFLINE = {"dataset_size": 60, "bc_updates": 2, "dice_updates": 2, "prior_updates": 2, "dice_width": 16, "prior_width": 8}
 SMALL = {"rollout_size": 50, "batch_size": 25, "pretraining": OFFLINE, "policy_kwargs": {"net_arch": [8]}, "normalize": True}
@@ -232,20 +233,6 @@ def test_a_small_file_cannot_take_much_memory(tmp_path):
         archive.writestr("a.npy", header.getvalue() + bytes(80))
     with pytest.raises(ValueError, match="is damaged"):
         read_arrays(tmp_path / "lie.npz")
-
-
-class Payload:
-    """Executed when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = str(path)
-
-    def __reduce__(self) -> tuple:
-        return Path.touch, (Path(self.path),)
-
-
-def crafted_npz(path: Path, executed: Path, **arrays: np.ndarray) -> None:
-    np.savez(path, **{**arrays, "payload": np.array([Payload(executed)], dtype=object)})
 
 
 READERS = {

@@ -23,8 +23,8 @@ from sb3_fedguide.seeding import Role, seed_sequence
 from sb3_fedguide.server.metrics import merge_figures
 from sb3_fedguide.server.payload import N_SAMPLES
 from tests.conftest import assert_same_parameters
-from tests.test_engines import Here
-from tests.test_site import CLIENTS, N_ROUNDS, federation, in_process, make
+from tests.loop_engine import Here
+from tests.sites import CLIENTS, N_ROUNDS, federation, in_process, make
 
 AVERAGING = ["fedavg", "fedprox", "fedkl", "fedsvrpgm", "fedrl", "fedguide-r"]
 #: with which nothing is clipped
