@@ -16,7 +16,7 @@ USAGE = """usage: fedguide COMMAND ...
   push       a run to the Hugging Face hub, without pickle, with a model card
   pull       a run from there, checked
   benchmark  methods on families with seeds, as runs that can be interrupted, and tables of their results
-  plot       figures of a benchmark's results or of runs: learning curves, bars, clients, aggregates, speed-up
+  plot       figures of a benchmark's results or of runs: learning curves, bars, rollouts, transport plan, ...
   tune       search for an algorithm's hyperparameters with Optuna
   deploy     a federation over a network: certificates, keys, server and clients
   dataset    a Minari dataset for the offline stage from CSV or NPZ logs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -106,7 +107,7 @@ class Study:
     """A study, checked as far as that goes without its families.
 
     :param name: of its file
-    :param metadata: absolute paths
+    :param metadata: paths from here
     :param folder: of the results
     """
 
@@ -156,14 +157,14 @@ def _study(path: Path, content: Any) -> Study:
         title=file.title,
         rows=rows,
         families=file.families,
-        metadata=[str(path.parent / name) for name in file.metadata],
+        metadata=[_beside(path, name) for name in file.metadata],
         baseline=file.baseline,
         at_rounds=file.at_rounds,
         overview=file.overview,
         eval_freq=file.eval_freq,
         eval_episodes=file.eval_episodes,
         eval_average=file.eval_average,
-        folder=FOLDER if file.folder is None else str(path.parent / file.folder),
+        folder=FOLDER if file.folder is None else _beside(path, file.folder),
         processes=file.processes,
     )
 
@@ -178,7 +179,7 @@ def _row(path: Path, file: StudyFile, name: str, entry: Mapping[str, Any]) -> Ro
     algo = own.algo or name
     check_names([algo], ALGORITHMS, f"algorithm of method {name!r}:" if own.algo else "algorithm")
     conf = own.conf or file.conf
-    conf = conf if conf in CONFIGURATIONS or not Path(conf).suffix else str(path.parent / conf)
+    conf = conf if conf in CONFIGURATIONS or not Path(conf).suffix else _beside(path, conf)
     label = own.label or file.label or Path(conf).stem
     flags = ["-conf", conf, "--label", label]
     params = {**dict(_dotted(file.params)), **dict(_dotted(own.params))}
@@ -189,6 +190,11 @@ def _row(path: Path, file: StudyFile, name: str, entry: Mapping[str, Any]) -> Ro
     seeds = file.seeds if own.seeds is None else own.seeds
     check_once(f"seeds of method {name!r}", seeds)
     return Row(name, algo, label, seeds, own.families, flags + ["--eval-average"] * file.eval_average)
+
+
+def _beside(path: Path, name: str) -> str:
+    """A path in the study's file is relative to the file's folder."""
+    return os.path.normpath(path.parent / name)
 
 
 def _dotted(params: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

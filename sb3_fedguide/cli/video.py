@@ -24,7 +24,7 @@ SMALLEST = 480
 FASTEST = 34
 #: Frames of a GIF: more would make it unwieldy.
 MAX_FRAMES = 200
-_COLORS = 128
+_COLORS = 64
 
 
 def check_format(suffix: str) -> None:
@@ -92,7 +92,7 @@ def _write_gif(path: Path, frames: list[Image], rate: float) -> None:
 
     from fed_envs.files import atomic_file
 
-    first, *others = (frame.quantize(_COLORS, dither=Image.Dither.NONE) for frame in frames)
+    first, *others = (frame.quantize(_COLORS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE) for frame in frames)
     durations = [round(1000 / rate)] * len(others) + [1000]  # ms; the end can be read
     with atomic_file(path, "wb") as file:
         first.save(file, format="GIF", save_all=True, append_images=others, duration=durations, loop=0)
