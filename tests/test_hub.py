@@ -232,6 +232,12 @@ def changed_arrays(run: Path, folder: Path, name: str, **arrays: np.ndarray | No
     return (folder / "changed.npz").read_bytes()
 
 
+def of_gymnasium(metadata: dict, clients: list[dict]) -> bytes:
+    """Metadata of registered environments."""
+    world = {"world": "gymnasium", "backbone": "Gymnasium", "max_episode_steps": 10}
+    return json.dumps({**metadata, **world, "clients": clients}).encode()
+
+
 def hostile(kind: str, files: dict[str, bytes], run: Path, folder: Path) -> None:
     """Change a repository's files into something that must not get through."""
     config, metadata = yaml.safe_load(files["config.yml"]), json.loads(files["metadata.json"])
@@ -266,12 +272,13 @@ def hostile(kind: str, files: dict[str, bytes], run: Path, folder: Path) -> None
         files["summary.json"] = b"[" * 100_000
     elif kind == "keyword arguments":
         clients = [{"client": k, "id": "Ant-v5", "kwargs": {"xml_file": "/etc/passwd"}} for k in range(4)]
-        files["metadata.json"] = json.dumps({**metadata, "world": "gymnasium", "backbone": "Gymnasium", "clients": clients,
-                                             "max_episode_steps": 10}).encode()  # fmt: skip
+        files["metadata.json"] = of_gymnasium(metadata, clients)
+    elif kind == "unknown argument":
+        clients = [{"client": k, "id": "Pendulum-v1", "kwargs": {"foo": 1}} for k in range(4)]
+        files["metadata.json"] = of_gymnasium(metadata, clients)
     elif kind == "module":
         clients = [{"client": k, "id": "this:Ant-v5"} for k in range(4)]
-        files["metadata.json"] = json.dumps({**metadata, "world": "gymnasium", "backbone": "Gymnasium", "clients": clients,
-                                             "max_episode_steps": 10}).encode()  # fmt: skip
+        files["metadata.json"] = of_gymnasium(metadata, clients)
     else:
         assert kind == "missing"
         del files["parameters.npz"]
@@ -292,6 +299,7 @@ HOSTILE = {
     "algorithm": "unknown algorithm '../../x'",
     "depth": "summary.json is not valid JSON",
     "keyword arguments": "keyword argument '/etc/passwd', which may name a file or a module",
+    "unknown argument": "me/run/metadata.json: client 0: the function that makes its environment raised TypeError",
     "module": "no environment 'this:Ant-v5' is registered",
     "missing": "me/run is no run that 'fedguide push' sent: it has no parameters.npz",
 }

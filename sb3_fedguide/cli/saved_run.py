@@ -60,15 +60,20 @@ def _remedy(folder: Path, missing: str) -> str:
 def load_model(folder: Path, config: Config, family: Family) -> Federation:
     """The run's model from its settings and arrays; SB3's archive beside them, which would be unpickled, is left alone.
 
-    :raises ValueError: if the two do not belong together
+    :raises ValueError: if the two do not belong together, or a client's environment cannot be made
     """
     import torch as th
 
     from fed_envs import FederatedVecEnv
+    from fed_envs.faults import ClientError
     from sb3_fedguide.cli.run_folder import PARAMETERS
 
     th.set_num_threads(1)
-    model = config.make(FederatedVecEnv(family, config.values["n_envs_per_client"]), seed=0, device="cpu")
+    try:
+        env = FederatedVecEnv(family, config.values["n_envs_per_client"])
+    except ClientError as error:  # of keyword arguments that its metadata give it
+        raise ValueError(f"{folder / 'metadata.json'}: {error}") from None
+    model = config.make(env, seed=0, device="cpu")
     model.import_parameters(folder / PARAMETERS)
     return model
 
