@@ -99,7 +99,7 @@ def test_kl_fixed_point_is_the_log_mean_exp() -> None:
     np.testing.assert_allclose(train_on_chain("kl"), expected, atol=0.05)
 
 
-@pytest.mark.parametrize("name", ["soft_chi", "chi2"])
+@pytest.mark.parametrize("name", ["soft_chi", pytest.param("chi2", marks=pytest.mark.slow)])
 def test_fixed_point_on_a_chain(name: str) -> None:
     np.testing.assert_allclose(train_on_chain(name), chain_fixed_point(name, 1.0), atol=0.05)
 
