@@ -277,6 +277,18 @@ def test_the_apps_bundle_holds_no_code() -> None:
         assert sorted(bundle.namelist()) == [".info/CONTENT", "pyproject.toml"]
 
 
+def test_a_run_that_flower_ended_early_has_failed(tmp_path, keys, certificates, capsys) -> None:
+    """Flower's process ends with code 0 also where its token was refused, before the first round."""
+    from sb3_fedguide.deployment.flower.server_app import FINISHED
+    from sb3_fedguide.deployment.flower.server_node import ServerNode
+
+    node = ServerNode(("127.0.0.1", 0), certificates, {}, tmp_path / "server.json", tmp_path)
+    assert [node._outcome(code) for code in (None, 2, 0)] == [1, 2, 1]
+    assert "start the server again" in capsys.readouterr().err
+    (tmp_path / FINISHED).touch()
+    assert node._outcome(0) == 0
+
+
 def test_flower_is_told_to_be_silent() -> None:
     """Whatever part of the package is imported first, Flower's telemetry is off, in this process and those it starts."""
     code = (

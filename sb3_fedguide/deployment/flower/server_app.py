@@ -21,6 +21,8 @@ from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 
 #: Environment variable with the path of what the server is told. Flower's own run configuration would go to the clients.
 CONFIG = "FEDGUIDE_SERVER_CONFIG"
+#: In the server's folder once the federation is over. Flower's process ends with code 0 also where it never got to this app.
+FINISHED = "finished"
 
 logger = logging.getLogger(__name__)
 app = ServerApp()
@@ -38,6 +40,7 @@ def main(grid: Grid, context: Context) -> None:
     log = RoundLog(Path(told["folder"]) / "tb")
     try:
         serve(ServerConfig(**told["server"]), FlowerTransport(grid, clients), told["folder"], log)
+        (Path(told["folder"]) / FINISHED).touch()
     except TooFewClients as error:
         logger.error("%s; the next start goes on from the last checkpoint", error)
         sys.exit(EXIT_FAILED)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -29,7 +30,7 @@ from sb3_fedguide.deployment.flower.processes import (
     runtime_version,
 )
 from sb3_fedguide.deployment.flower.proxy import FleetProxy, ProxyServer
-from sb3_fedguide.deployment.flower.server_app import CONFIG
+from sb3_fedguide.deployment.flower.server_app import CONFIG, FINISHED
 from sb3_fedguide.exit_codes import EXIT_FAILED
 
 _POLL_SECONDS = 0.2
@@ -75,6 +76,7 @@ class ServerNode:
         :return: exit code: 0, that of the round loop, or 1 where another part of it failed
         :raises OSError: where it could not be started
         """
+        (self._folder / FINISHED).unlink(missing_ok=True)
         certificate, key = self._certificates / SERVER, self._certificates / SERVER_KEY
         host, port = self._address.split(":")
         arguments = [
@@ -93,7 +95,16 @@ class ServerNode:
             app = stack.enter_context(self._start_app(run, link))
             while app.exit_code is None and link.exit_code is None and proxy.alive:
                 time.sleep(_POLL_SECONDS)
-            return EXIT_FAILED if app.exit_code is None else app.exit_code
+            return self._outcome(app.exit_code)
+
+    def _outcome(self, code: int | None) -> int:
+        """The exit code for that of the round loop's process, ``None`` where another process ended first."""
+        if code == 0 and not (self._folder / FINISHED).is_file():
+            print(
+                "Flower ended the run before its first round or in the middle of it; start the server again", file=sys.stderr
+            )
+            return EXIT_FAILED
+        return EXIT_FAILED if code is None else code
 
     def _wait_for(self, link: FlowerProcess) -> ControlHttpClient:
         """Wait until the SuperLink answers."""
