@@ -28,6 +28,8 @@ def train(argv: list[str], packages: list[Path], cwd: Path = ROOT) -> subprocess
                 sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))
                 os.chdir(cwd)
                 sys.path[:0] = map(str, packages)
+                for name in {path.stem for folder in packages for path in folder.glob("*.py")} & sys.modules.keys():
+                    del sys.modules[name]  # it registers again what the test that imported it has taken back
                 sys.argv = [str(ROOT / "train.py"), *argv]
                 runpy.run_path(sys.argv[0], run_name="__main__")
             except SystemExit as exit:

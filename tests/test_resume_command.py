@@ -136,6 +136,7 @@ def moments(seed: int, n: int) -> list[list]:
     return drawn
 
 
+@pytest.mark.slow
 def test_a_run_survives_kills_at_random_moments(driver, tmp_path):
     assert survive(driver, "fedguide-a", "Bandit2D", tmp_path, moments(3, 3), rounds=4) >= 2
 
@@ -154,6 +155,7 @@ def test_a_run_survives_kills_inside_the_write_of_a_checkpoint(kills, driver, tm
     assert survive(driver, "local", "Bandit2D", tmp_path, kills, rounds=8) == len(kills)
 
 
+@pytest.mark.slow
 def test_a_run_survives_kills_inside_the_offline_stage(driver, tmp_path):
     kills = [["array", 3], ["replace", 9], ["array", 14]]
     assert survive(driver, "fedguide", "Bandit2D", tmp_path, kills, rounds=2) == len(kills)
@@ -283,7 +285,7 @@ def test_a_finished_run_goes_on_for_longer(driver, tmp_path, capsys):
     assert f"no checkpoint to go on from; start a new run from what it has learned with -i {folder}" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("algo", ["fedavg", "fedguide"])
+@pytest.mark.parametrize("algo", ["fedavg", pytest.param("fedguide", marks=pytest.mark.slow)])
 def test_a_run_starts_from_what_another_has_learned(algo, driver, tmp_path, capsys):
     log = tmp_path / "log.txt"
     assert driver(arguments(algo, "Bandit2D", tmp_path, 2), log) == 0

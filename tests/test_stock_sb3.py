@@ -20,6 +20,7 @@ def test_stock_ppo_trains_on_a_registered_id(name):
     assert np.isfinite([mean, deviation]).all()
 
 
+@pytest.mark.slow
 def test_stock_ppo_solves_a_bandit_client():
     env = make_vec_env("fed_envs/Bandit2D-v0", n_envs=8, env_kwargs={"client": 1}, seed=0)
     model = PPO("MlpPolicy", env, n_steps=32, batch_size=64, learning_rate=3e-3, gamma=0.0, seed=0, device="cpu").learn(20_000)

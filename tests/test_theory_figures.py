@@ -142,5 +142,5 @@ def test_results_of_a_benchmark_have_no_log(tmp_path, capfd):
 
     result(tmp_path)
     flags = ["--envs", "Bandit2D", "-f", str(tmp_path), "--figures", "lemma2", "-o", str(tmp_path / "out")]
-    assert main(flags) == 2 and "give folders instead of --envs" in capfd.readouterr().err
+    assert main(flags) == 2 and "give them instead of --envs" in capfd.readouterr().err
     assert json.loads((tmp_path / "Bandit2D-tuned" / "local-seed0.json").read_text())["algo"] == "local"

@@ -85,6 +85,9 @@ class _HowItIsAveraged(TypedDict, total=False):
     trim_fraction: float
     server_momentum: float
     mix: float | Schedule
+    noise_multiplier: float
+    clipping_norm: float | None
+    delta: float
 
 
 class AveragingArguments(_WhatIsAveraged, _HowFarAndTested, _HowItIsAveraged, total=False):
