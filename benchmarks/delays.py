@@ -98,8 +98,8 @@ class Course(RoundCallback):
         assert delays is not None
         self.deployed = np.where(delays.finished, self.trained, self.deployed)
         self.rows.append((delays.seconds, float(self.deployed.mean())))
-        self.arrived.append(delays.figures["federated/arrived"])
-        self.staleness.append(delays.figures.get("federated/staleness", np.nan))
+        self.arrived.append(delays.metrics["federated/arrived"])
+        self.staleness.append(delays.metrics.get("federated/staleness", np.nan))
 
 
 def run_cell(n_clients: int, algo: str, waiting: str, seed: int) -> dict[str, Any]:
@@ -168,7 +168,7 @@ def replay(n_clients: int, waiting: str, seed: int) -> tuple[float, float, float
     for round in range(ROUNDS[waiting]):
         delays.begin(round)
         heard += delays.end()
-        staleness.append(delays.figures.get("federated/staleness", 0.0))
+        staleness.append(delays.metrics.get("federated/staleness", 0.0))
     n_rounds = ROUNDS[waiting]
     return delays.seconds / n_rounds, heard.mean() / n_rounds, float((heard == 0).mean()), float(np.mean(staleness))
 

@@ -157,5 +157,5 @@ def _words(clients: Sequence[Client]) -> list[str]:
     """Each client's names, of presets for instance, where the clients' differ."""
     contents = [client.parameters() for client in clients]
     fields = [field for field in contents[0] if all(isinstance(content[field], str) for content in contents)]
-    told = [field for field in fields if len({content[field] for content in contents}) > 1]
-    return [" ".join(content[field] for field in told).replace("_", " ") for content in contents]
+    varying = [field for field in fields if len({content[field] for content in contents}) > 1]
+    return [" ".join(content[field] for field in varying).replace("_", " ") for content in contents]

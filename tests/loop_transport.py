@@ -55,7 +55,7 @@ class LoopTransport:
             self.sites[client] = self.make(client)
         return self.sites[client]
 
-    def exchange(self, requests: Mapping[int, Message], timeout: float | None) -> dict[int, Message | Failure]:
+    def send_and_receive(self, requests: Mapping[int, Message], timeout: float | None) -> dict[int, Message | Failure]:
         return {client: self._deliver(client, request) for client, request in requests.items()}
 
     def _deliver(self, client: int, request: Message) -> Message | Failure:

@@ -60,9 +60,9 @@ def test_staleness_counts_the_rounds_since_a_client_began():
     for round in range(3):
         delays.begin(round)
         delays.end()
-        staleness.append(delays.figures["federated/staleness"])
+        staleness.append(delays.metrics["federated/staleness"])
     # Client 1 began in round 0 and is heard in round 2, with client 0 who began in it.
-    assert staleness == [0, 0, 1.0] and delays.figures == {
+    assert staleness == [0, 0, 1.0] and delays.metrics == {
         "federated/simulated_seconds": 30, "federated/arrived": 2, "federated/staleness": 1.0
     }  # fmt: skip
 

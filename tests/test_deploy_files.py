@@ -104,7 +104,7 @@ def test_the_containers_configurations_are_sound(certificates: Path, keys: Path,
         shutil.copy(certificates / "ca.crt", site)
         shutil.copy(keys / name, site / f"client_{k}")
         shutil.copy(keys / f"{name}.pub", server / f"client_{k}.pub")
-    told = ServerDeployment(server / "server.yml").told()["server"]
+    told = ServerDeployment(server / "server.yml").process_settings()["server"]
     clients = [ClientDeployment(site / "client.yml") for site in sites]
     assert told["n_clients"] == len(clients) and {client.server for client in clients} == {"server:9443"}
     given = [yaml.safe_load((site / "client.yml").read_text()) for site in sites]

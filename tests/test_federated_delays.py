@@ -16,7 +16,7 @@ from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.participation import ParticipationAdam, simulate_delays
 from sb3_fedguide.server.averaging import Averaging
 from sb3_fedguide.server.delays import Delays, DelaySettings, parse_delays
-from sb3_fedguide.server.rounds import Rounds
+from sb3_fedguide.server.rounds import Coordinator
 from sb3_fedguide.server.strategy import Composite
 from tests.conftest import others_slow
 from tests.loop_engine import Here
@@ -147,7 +147,7 @@ def test_a_stale_upload_is_averaged_in_the_tick_in_which_it_comes():
 
 
 def test_who_was_busy_while_the_others_were_sent_more_than_it_gets_now_catches_up():
-    rounds = Rounds(Composite([Averaging(("a",)), Averaging(("b",), average_every=2)]))
+    rounds = Coordinator(Composite([Averaging(("a",)), Averaging(("b",), average_every=2)]))
 
     def upload(value: float) -> dict[str, np.ndarray]:
         return {name: np.full(2, value, dtype=np.float32) for name in "ab"} | {"n_samples": np.array(8, dtype=np.float32)}

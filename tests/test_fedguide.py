@@ -156,7 +156,7 @@ def test_dice_values_are_in_the_scale_of_normalised_rewards(tiny):
     model.learn(ROUND)
     raw = model.rollout_buffer.rows(model.rollout_buffer.raw_observations)[0]
     ratio = model.dice.client_values(0, raw) / model._dice_values(0, raw)
-    np.testing.assert_allclose(ratio, model.normalizer.reward_deviation[0], rtol=1e-4)
+    np.testing.assert_allclose(ratio, model.normalizer.reward_std[0], rtol=1e-4)
 
 
 def test_optimal_blend_minimises_the_variance():

@@ -154,7 +154,7 @@ def test_a_request_that_flower_does_not_take_is_a_failure(refused: list[str | No
     from sb3_fedguide.deployment.flower.transport import FlowerTransport
 
     requests = {client: Message("round", 1) for client in (0, 1, 2)}
-    replies = FlowerTransport(Grid(refused, ["1"]), {b"a": 0, b"b": 1, b"c": 2}).exchange(requests, 60.0)  # type: ignore[arg-type]
+    replies = FlowerTransport(Grid(refused, ["1"]), {b"a": 0, b"b": 1, b"c": 2}).send_and_receive(requests, 60.0)  # type: ignore[arg-type]
     assert replies == {0: Failure("gone"), 1: Message("round", 1), 2: Failure("gone")}
 
 
@@ -165,7 +165,7 @@ def test_no_timeout_is_none(timeout: float | None, limit: float) -> None:
     from sb3_fedguide.deployment.flower.transport import FlowerTransport
 
     grid = Grid(["1"])
-    assert FlowerTransport(grid, {b"a": 0}).exchange({0: Message("round", 1)}, timeout) == {0: Message("round", 1)}  # type: ignore[arg-type]
+    assert FlowerTransport(grid, {b"a": 0}).send_and_receive({0: Message("round", 1)}, timeout) == {0: Message("round", 1)}  # type: ignore[arg-type]
     assert grid.limits == [limit]
 
 

@@ -14,7 +14,7 @@ from sb3_fedguide.server.averaging import Averaging
 from sb3_fedguide.server.build import Method, complete_settings, find_method, make_strategy, method_of
 from sb3_fedguide.server.ot_moe import OTMoE
 from sb3_fedguide.server.participants import draw_participants
-from sb3_fedguide.server.rounds import Rounds, participants
+from sb3_fedguide.server.rounds import Coordinator, participants
 from sb3_fedguide.server.svrpg import SVRPG
 from sb3_fedguide.settings.schema import hyperparameters
 from tests.loop_transport import NAME, upload
@@ -23,34 +23,34 @@ from tests.loop_transport import NAME, upload
 
 
 def test_who_misses_what_others_receive_catches_up_once():
-    rounds = Rounds(Averaging(average_every=2))
+    rounds = Coordinator(Averaging(average_every=2))
     assert rounds.exchange(1, {0: upload(1), 1: upload(3)}, absent=[2]) == {0: {}, 1: {}} and rounds.outdated == set()
     broadcasts = rounds.exchange(2, {0: upload(1), 1: upload(3)}, absent=[2])
     np.testing.assert_array_equal(broadcasts[0][NAME], [2, 2, 2])
     assert rounds.outdated == {2} and (rounds.bytes_up, rounds.bytes_down) == (4 * 16, 2 * 12)
     np.testing.assert_array_equal(rounds.catch_up(2)[NAME], [2, 2, 2])
     assert rounds.outdated == set() and rounds.bytes_down == 3 * 12
-    assert rounds.figures["federated/bytes_total"] == 4 * 16 + 2 * 12 and rounds.figures["federated/bytes_down"] == 24
+    assert rounds.metrics["federated/bytes_total"] == 4 * 16 + 2 * 12 and rounds.metrics["federated/bytes_down"] == 24
 
 
 def test_what_comes_before_the_first_round_is_counted_apart():
-    rounds = Rounds(Averaging())
+    rounds = Coordinator(Averaging())
     rounds.count(1000, 3000, offline=True)
     rounds.exchange(0, {0: upload(1), 1: upload(3)})
     before = 1000 + 2 * 16
     assert rounds.offline_bytes_up == rounds.bytes_up == before
     rounds.exchange(1, {0: upload(1), 1: upload(3)})
     assert (rounds.bytes_up - rounds.offline_bytes_up, rounds.bytes_down - rounds.offline_bytes_down) == (2 * 16, 2 * 12)
-    assert rounds.figures["federated/bytes_offline"] == before + rounds.offline_bytes_down
-    again, earlier = Rounds(None), Rounds(None)
+    assert rounds.metrics["federated/bytes_offline"] == before + rounds.offline_bytes_down
+    again, earlier = Coordinator(None), Coordinator(None)
     again.bytes_counted, earlier.bytes_counted = rounds.bytes_counted, rounds.bytes_counted[:2]
     assert again.bytes_counted == rounds.bytes_counted and earlier.bytes_counted == [*rounds.bytes_counted[:2], 0, 0]
 
 
 def test_who_is_rejected_is_outdated():
-    rounds = Rounds(Averaging())
+    rounds = Coordinator(Averaging())
     assert sorted(rounds.exchange(1, {0: upload(1), 1: upload(np.nan), 2: "nothing"})) == [0]
-    assert rounds.outdated == {1, 2} == rounds.rejected.keys() and rounds.figures["federated/rejected"] == 2
+    assert rounds.outdated == {1, 2} == rounds.rejected.keys() and rounds.metrics["federated/rejected"] == 2
 
 
 def test_participants_are_those_of_a_federation_in_process():

@@ -288,7 +288,7 @@ def test_who_is_away_at_the_end_hears_of_it_when_it_comes_back(tmp_path):
         *((client, "finish", 5) for client in range(4)),
         (2, "finish", 5),
     ]
-    assert sorted(server.told) == [0, 1, 2, 3] and server.outbox == {}
+    assert sorted(server.dismissed) == [0, 1, 2, 3] and server.outbox == {}
     np.testing.assert_array_equal(transport.site(2).theta, expected())
     assert [row["round"] for row in rows] == [1, 2, 3, 4, 5, 5]  # of those who come late there is no average
     assert len((tmp_path / "waits" / "evaluations.csv").read_text().splitlines()) == 1 + 5 * 4 + 4
@@ -299,7 +299,7 @@ def test_a_finished_server_that_is_started_again_tells_who_was_away(tmp_path, ca
     transport.undelivered = {(2, "finish", 5)}
     with caplog.at_level(logging.WARNING):
         _, server, _ = run(transport=transport, folder=tmp_path)
-    assert server.finished and server.told == [0, 1, 3] and list(server.outbox) == [2]
+    assert server.finished and server.dismissed == [0, 1, 3] and list(server.outbox) == [2]
     assert "clients [2] have not heard that the run is over" in caplog.text
     nobody = LoopTransport(Client, [])
     run(transport=nobody, folder=tmp_path)

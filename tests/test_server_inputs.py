@@ -15,7 +15,7 @@ import pytest
 
 from fed_envs.faults import ClientError
 from sb3_fedguide.deployment.transport import Message
-from sb3_fedguide.server.metrics import ClientEvaluation, evaluation_figures, merge_figures, read_evaluations
+from sb3_fedguide.server.metrics import ClientEvaluation, evaluation_metrics, merge_metrics, read_evaluations
 from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_fault
 from tests.loop_transport import NAME, Client, LoopTransport, run
 
@@ -26,11 +26,11 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def test_reports_are_data_of_strangers():
-    assert merge_figures(
+    assert merge_metrics(
         {0: {"figures": "none"}, 1: {}, 2: {"figures": {1: 2, "a": "b", "c": True, "d": 3, "eval/x": 1}}}
     ) == {"d": 3}
     hostile = {"a": 10**400, "b": float("nan"), "c": float("-inf"), "client_1/d": 10**400, "client_1/e": float("nan"), "f": 2}
-    assert merge_figures({0: {"figures": {"a": 1, "b": 2.0}}, 1: {"figures": hostile}}) == {"a": 1.0, "b": 2.0, "f": 2.0}
+    assert merge_metrics({0: {"figures": {"a": 1, "b": 2.0}}, 1: {"figures": hostile}}) == {"a": 1.0, "b": 2.0, "f": 2.0}
     good = ClientEvaluation(4, 2, "broadcast", [1.0, 2.0], [3, 4], [True, False])
     assert read_evaluations(4, {"evaluations": [good.facts()]}) == [good]
     for change in (
@@ -40,7 +40,7 @@ def test_reports_are_data_of_strangers():
     ):  # fmt: skip
         assert read_evaluations(4, {"evaluations": [{**good.facts(), **change}]}) == []
     assert read_evaluations(4, {"evaluations": "x"}) == read_evaluations(4, {"evaluations": [3, None]}) == []
-    figures = evaluation_figures([good, ClientEvaluation(1, 2, "deployed", [4.0], [2], [True])])
+    figures = evaluation_metrics([good, ClientEvaluation(1, 2, "deployed", [4.0], [2], [True])])
     assert figures["eval/broadcast_mean_reward"] == 1.5 and figures["eval/success_rate"] == 1.0
 
 
@@ -133,7 +133,7 @@ class Transport:
     def clients(self):
         return [0, 1, 2]
 
-    def exchange(self, requests, timeout):
+    def send_and_receive(self, requests, timeout):
         return {client: self.reply(client, request) for client, request in requests.items()}
 
     def reply(self, client, request):

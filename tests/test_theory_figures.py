@@ -23,7 +23,7 @@ from sb3_fedguide.benchmark.figures.theory import (
 from sb3_fedguide.cli.plot import main
 from sb3_fedguide.cli.plot_logs import read_scalars
 from sb3_fedguide.cli.plot_runs import read_run_folder
-from sb3_fedguide.common.value_blend import baseline_figures
+from sb3_fedguide.common.value_blend import baseline_metrics
 
 #: Key to the values of rounds 1, 2, ...; ``None`` where nothing was logged.
 LEMMA = {
@@ -82,7 +82,7 @@ def test_the_logged_optimum_is_the_lemmas():
     online, noise = rng.normal(size=(2, 500)), rng.normal(size=(2, 500))
     returns = online + rng.normal(size=(2, 500))
     dice = online + np.array([[1.0], [-1.0]]) * (returns - online) + 0.8 * noise
-    figures = baseline_figures(returns, online, dice, online)
+    figures = baseline_metrics(returns, online, dice, online)
     assert 0 < figures["beta_optimal"][0] < 1 == figures["beta_optimal"][1] and figures["residual_correlation"][1] < 0
     variance, best = figures["advantage_variance_online"], figures["advantage_variance_optimal"]
     assert best[0] == pytest.approx(variance[0] * (1 - figures["residual_correlation"][0] ** 2)) and best[1] == variance[1]

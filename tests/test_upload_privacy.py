@@ -20,7 +20,7 @@ from sb3_fedguide.deployment.serve import serve
 from sb3_fedguide.deployment.site import Site
 from sb3_fedguide.registry import algorithm
 from sb3_fedguide.seeding import Role, seed_sequence
-from sb3_fedguide.server.metrics import merge_figures
+from sb3_fedguide.server.metrics import merge_metrics
 from sb3_fedguide.server.payload import N_SAMPLES
 from tests.conftest import assert_same_parameters
 from tests.loop_engine import Here
@@ -63,7 +63,7 @@ def test_what_is_clipped_keeps_its_direction_and_has_the_norm(algo):
     assert np.linalg.norm(sent) == pytest.approx(0.01, rel=1e-3)  # float32
     assert sent @ clean / np.linalg.norm(sent) / np.linalg.norm(clean) == pytest.approx(1, abs=1e-4)
     assert model.privacy_state["norm"][1] == pytest.approx(np.linalg.norm(clean))
-    assert model.privacy_state["clipped"][1] > 0 and model.upload_figures()["privacy/clipped"] > 0
+    assert model.privacy_state["clipped"][1] > 0 and model.upload_metrics()["privacy/clipped"] > 0
 
 
 def test_noise_has_the_variance_of_the_formula_and_is_another_for_everybody_and_every_upload():
@@ -101,7 +101,7 @@ def test_who_was_away_counts_the_rounds_in_which_it_uploaded():
     uploads = model.privacy_state["uploads"]
     assert uploads.sum() == 5 * model.n_participants < 5 * model.n_clients
     expected = epsilon(0.05, int(uploads.max()), 1e-5)
-    assert model.upload_figures()["privacy/epsilon"] == model.upload_summary()["epsilon"] == expected
+    assert model.upload_metrics()["privacy/epsilon"] == model.upload_summary()["epsilon"] == expected
 
 
 @pytest.mark.parametrize("more", [{"aggregator": "median"}, {"server_step": "exp", "server_momentum": 0.5}, {"mix": 0.5}])
@@ -227,14 +227,14 @@ def test_a_site_sends_nothing_beside_its_uploads_that_depends_on_its_data(tmp_pa
     with pytest.raises(ValueError, match="set report: false"):
         Site(make("fedavg", "Bandit2D", [0], **PRIVATE), N_ROUNDS, tmp_path / "site")
     config, transport = private_federation("fedguide-r", tmp_path)
-    exchange, facts = transport.exchange, []
+    exchange, facts = transport.send_and_receive, []
 
     def watched(requests, timeout):
         replies = exchange(requests, timeout)
         facts.extend(reply.facts for reply in replies.values() if reply.kind == "round")
         return replies
 
-    transport.exchange = watched  # type: ignore[method-assign]
+    transport.send_and_receive = watched  # type: ignore[method-assign]
     serve(config, transport, tmp_path / "server")
     assert len(facts) == len(CLIENTS) * N_ROUNDS
     public = {"privacy/epsilon", "privacy/noise_multiplier"}
@@ -260,7 +260,7 @@ def test_a_client_with_less_noise_than_the_others_is_refused(tmp_path):
 
 def test_the_largest_epsilon_of_a_round_is_logged():
     facts = {0: {"figures": {"privacy/epsilon": 3.0, "x": 1.0}}, 1: {"figures": {"privacy/epsilon": 5.0, "x": 2.0}}}
-    assert merge_figures(facts) == {"privacy/epsilon": 5.0, "x": 1.5}
+    assert merge_metrics(facts) == {"privacy/epsilon": 5.0, "x": 1.5}
 
 
 def exact_delta(value: float, mu: float) -> float:

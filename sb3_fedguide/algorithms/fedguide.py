@@ -10,13 +10,13 @@ import torch as th
 from stable_baselines3.common.type_aliases import Schedule
 
 from fed_envs.state import State
-from sb3_fedguide.algorithms.fedguide_parts import begin_parts, held_parts, part_arrays, set_part_arrays
+from sb3_fedguide.algorithms.fedguide_parts import begin_parts, offline_parts, part_arrays, set_part_arrays
 from sb3_fedguide.common.arguments import FederatedPPOArguments, FedGuideAArguments
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.parameter_averaging import ParameterAveraging
 from sb3_fedguide.common.rollout_buffer import FederatedSamples, generalized_advantage
-from sb3_fedguide.common.value_blend import baseline_figures, optimal_blend
+from sb3_fedguide.common.value_blend import baseline_metrics, optimal_blend
 from sb3_fedguide.offline.dice import DiceValue, calibrate
 from sb3_fedguide.offline.pretraining import Pretraining
 from sb3_fedguide.priors.adaptation import HeadAdaptation
@@ -162,7 +162,7 @@ class FedGuide(FederatedPPO):
     def save_state(self) -> State:
         modules = {name: module and to_arrays(module.state_dict()) for name, module in self._frozen_modules().items()}
         adaptation = self.adaptation and self.adaptation.save_state()
-        return {**super().save_state(), "parts": held_parts(self), "modules": modules, "adaptation": adaptation}
+        return {**super().save_state(), "parts": offline_parts(self), "modules": modules, "adaptation": adaptation}
 
     def load_state(self, state: State) -> None:
         begin_parts(self, state["parts"], state["attributes"]["pretrained"])
@@ -192,8 +192,8 @@ class FedGuide(FederatedPPO):
         self._begin_calibration()
         if self.dice_scale is not None:
             for i in np.flatnonzero(self.present & ~self.calibrated).tolist():
-                deviation = self.normalizer.reward_deviation[i]
-                self.dice_scale[i] = calibrate(self.dice.client_values(i, raw[i]) / deviation, returns[i])
+                std = self.normalizer.reward_std[i]
+                self.dice_scale[i] = calibrate(self.dice.client_values(i, raw[i]) / std, returns[i])
                 self.calibrated[i] = True
         dice = np.stack([self._dice_values(i, raw[i]) for i in range(self.n_clients)])
         online = buffer.rows(buffer.values)
@@ -220,7 +220,7 @@ class FedGuide(FederatedPPO):
         )
         if self.critic_target == "blend":
             buffer.returns[:] = buffer.advantages + blended
-        figures = {"beta": beta, **baseline_figures(returns, online, dice, buffer.rows(blended))}
+        figures = {"beta": beta, **baseline_metrics(returns, online, dice, buffer.rows(blended))}
         for name, per_client in figures.items():
             self.logger.record(f"dice/{name}", float(per_client[self.present].mean()))
         for index in np.flatnonzero(self.present):
@@ -239,7 +239,7 @@ class FedGuide(FederatedPPO):
     def _dice_values(self, index: int, raw_obs: np.ndarray) -> np.ndarray:
         """V_phi of one client at raw observations ``(batch, obs_dim)``, in the scale of its rewards, ``(batch,)``."""
         assert self.dice is not None
-        values = self.dice.client_values(index, raw_obs) / self.normalizer.reward_deviation[index]
+        values = self.dice.client_values(index, raw_obs) / self.normalizer.reward_std[index]
         if self.dice_scale is not None:
             values = self.dice_scale[index, 0] * values + self.dice_scale[index, 1]
         return values.astype(np.float32)
@@ -340,7 +340,7 @@ class FedGuide(FederatedPPO):
         self.logger.record("prior/head_change", float(moved[self.present].mean()))
 
     def parameter_parts(self) -> list[str]:
-        return held_parts(self)
+        return offline_parts(self)
 
     def begin_parts(self, parts: Sequence[str], pretrained: bool) -> None:
         begin_parts(self, parts, pretrained)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 OPTIONAL = {"experts", "calibration"}
 
 
-def held_parts(model: FedGuide) -> list[str]:
+def offline_parts(model: FedGuide) -> list[str]:
     """Which parts there are at the moment."""
     held = {
         "prior": model.prior is not None,
@@ -72,7 +72,7 @@ def begin_parts(model: FedGuide, parts: Sequence[str], pretrained: bool) -> None
 def part_arrays(model: FedGuide) -> dict[str, np.ndarray]:
     """Every part's arrays by name."""
     arrays: dict[str, np.ndarray] = {}
-    parts = held_parts(model)
+    parts = offline_parts(model)
     if model.prior is not None:
         arrays |= to_arrays(model.prior.state_dict(), "prior/trunk/")
         arrays |= {"prior/heads": model.heads.copy(), "prior/moments": model.score_moments.copy()}

@@ -252,8 +252,8 @@ def read_results(
     found: dict[str, list[Result]] = {}
     for method in methods:
         pattern = re.compile(rf"{re.escape(method)}-seed(\d+)\.json")
-        there = result_folder(folder, family, label)
-        names = sorted(path.name for path in there.iterdir()) if there.is_dir() else []
+        place = result_folder(folder, family, label)
+        names = sorted(path.name for path in place.iterdir()) if place.is_dir() else []
         numbers = sorted(int(match[1]) for name in names if (match := pattern.fullmatch(name)))
         wanted = [seed for seed in numbers if seeds is None or seed in seeds]
         if wanted:

@@ -52,8 +52,8 @@ def require_results(folder: str, families: Iterable[str], rows: Sequence[TableRo
 
 def no_results(folder: str, family: str) -> str:
     """The message for a family without results, with the folders of results that there are."""
-    there = sorted(path.parent.name for path in Path(folder).glob("*/*-seed*.json"))
-    known = f"; there are {', '.join(dict.fromkeys(there))}" if there else ""
+    folders = sorted(path.parent.name for path in Path(folder).glob("*/*-seed*.json"))
+    known = f"; there are {', '.join(dict.fromkeys(folders))}" if folders else ""
     return f"{folder} has no results of {family} with these methods and seeds{known}"
 
 

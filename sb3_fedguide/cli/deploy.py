@@ -110,7 +110,7 @@ def _server(arguments: argparse.Namespace) -> int:
     deployment = ServerDeployment(arguments.config)
     config = _prepare(deployment.folder)
     with exclusive(deployment.folder):
-        write_json(config, deployment.told())
+        write_json(config, deployment.process_settings())
         node = ServerNode(deployment.listen, deployment.certificates, deployment.keys, config, deployment.folder)
         print(f"{deployment.server.n_clients} clients, {deployment.server.n_rounds} rounds, listening on "
               f"{deployment.listen[0]}:{deployment.listen[1]}, writing to {deployment.folder}", flush=True)  # fmt: skip
@@ -132,7 +132,7 @@ def _client(arguments: argparse.Namespace) -> int:
         # What is wrong with it is said now; in another process, since forks cannot use a GPU that this one has used.
         with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as processes:
             processes.submit(_try_site, deployment).result()
-        write_json(config, deployment.told())
+        write_json(config, deployment.process_settings())
         print(f"client {deployment.site.get('client')} of {deployment.server}, writing to {deployment.folder}", flush=True)
         node.run()
         print(f"the federation has had its last round; a new one needs a folder other than {deployment.folder}", flush=True)

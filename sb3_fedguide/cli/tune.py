@@ -210,8 +210,8 @@ def _run(tuning: Tuning, study: optuna.Study) -> int:
     """Do the trials that are missing and report each."""
     from sb3_fedguide.cli.signals import StopSignals
 
-    n_there = len(_begun(study))
-    _say(f"study {tuning.name}: {n_there} of {tuning.n_trials} trials there; {tuning.config.n_rounds} rounds and "
+    n_done = len(_begun(study))
+    _say(f"study {tuning.name}: {n_done} of {tuning.n_trials} trials there; {tuning.config.n_rounds} rounds and "
          f"{len(tuning.arguments.seeds)} seeds each, storage {tuning.storage}")  # fmt: skip
     active: list[ActiveTrial] = []
     outcomes: Counter[str] = Counter()
@@ -293,8 +293,8 @@ def _ask(tuning: Tuning, study: optuna.Study) -> optuna.Trial:
     else:
         study.sampler = optuna.samplers.RandomSampler(seed=len(trials))
     if tuning.arguments.sampler == "grid" and not any(trial.state == TrialState.WAITING for trial in trials):
-        there = [trial.params for trial in trials]
-        missing = next((setting for setting in tuning.space.grid() if setting not in there), None)
+        tried = [trial.params for trial in trials]
+        missing = next((setting for setting in tuning.space.grid() if setting not in tried), None)
         if missing is not None:
             study.enqueue_trial(missing)
     return study.ask()

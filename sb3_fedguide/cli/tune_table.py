@@ -31,8 +31,8 @@ def conclude(tuning: Tuning, study: optuna.Study) -> None:
     if not best:
         return
     counts = Counter(trial.state.name.lower() for trial in trials)
-    told = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
-    title = f"{tuning.arguments.algo} on {tuning.family.name}: {len(trials)} trials ({told})"
+    states = ", ".join(f"{count} {state}" for state, count in sorted(counts.items()))
+    title = f"{tuning.arguments.algo} on {tuning.family.name}: {len(trials)} trials ({states})"
     table = Table()
     for name in ("trial", "F", *tuning.space.entries):
         table.add_column(name, justify="right")

@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 
 from fed_envs.state import State, declared_state, load_declared
 from sb3_fedguide.common.digits import shown
-from sb3_fedguide.server.rounds import Rounds
+from sb3_fedguide.server.rounds import Coordinator
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
@@ -81,7 +81,7 @@ def round_callbacks(callback: BaseCallback | None) -> Iterator[RoundCallback]:
 class ExchangeCallback(RoundCallback):
     """Plays the server in process: carries uploads to the model's ``strategy`` and broadcasts back.
 
-    Over a network :func:`sb3_fedguide.deployment.serve.serve` takes its place; clients, strategy and :class:`Rounds` are
+    Over a network :func:`sb3_fedguide.deployment.serve.serve` takes its place; clients, strategy and :class:`Coordinator` are
     the same.
     """
 
@@ -89,11 +89,11 @@ class ExchangeCallback(RoundCallback):
 
     def __init__(self) -> None:
         super().__init__()
-        self.server = Rounds(None)
+        self.server = Coordinator(None)
 
     @property
     def bytes_counted(self) -> list[int]:
-        """See :attr:`Rounds.bytes_counted`."""
+        """See :attr:`Coordinator.bytes_counted`."""
         return self.server.bytes_counted
 
     @bytes_counted.setter
@@ -138,7 +138,7 @@ class ExchangeCallback(RoundCallback):
         delays, uploading = self.model.delays, self.model.present
         if delays is not None:
             uploading = delays.end()
-            for key, value in delays.figures.items():
+            for key, value in delays.metrics.items():
                 self.logger.record(key, value)
         if self.model.strategy is not None and uploading.any():
             self._exchange(uploading)
@@ -156,7 +156,7 @@ class ExchangeCallback(RoundCallback):
         for complaint in self.server.complaints:
             warnings.warn(f"round {model.round}: {complaint}", stacklevel=1)
         self._remember_outdated()
-        for key, value in {**self.server.figures, **model.upload_figures()}.items():
+        for key, value in {**self.server.metrics, **model.upload_metrics()}.items():
             self.logger.record(key, value)
         self.logger.record("time/exchange", time.perf_counter() - started)
 

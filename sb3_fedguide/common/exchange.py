@@ -80,7 +80,7 @@ class Exchange(BaseAlgorithm):
         """Whether what a client uploads has noise, so that nothing else of it may leave the client."""
         return False
 
-    def upload_figures(self, public: bool = False) -> dict[str, float]:
+    def upload_metrics(self, public: bool = False) -> dict[str, float]:
         """What is to be logged of this round's uploads, by log key.
 
         :param public: only what tells nothing of them

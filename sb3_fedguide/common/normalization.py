@@ -147,12 +147,12 @@ class FederatedNormalizer:
         returns = self.returns * self.gamma + rewards
         self.returns = returns if present is None else np.where(present[:, None], returns, self.returns)
         self.ret.update(self.returns, present)
-        scaled = np.clip(rewards / self.reward_deviation[:, None], -self.CLIP, self.CLIP)
+        scaled = np.clip(rewards / self.reward_std[:, None], -self.CLIP, self.CLIP)
         self.returns[dones] = 0.0
         return scaled
 
     @property
-    def reward_deviation(self) -> np.ndarray:
+    def reward_std(self) -> np.ndarray:
         """What rewards are divided by, ``(n_clients,)``; ones where rewards are not normalised."""
         return np.sqrt(self.ret.var + self.EPSILON) if self.norm_reward else np.ones_like(self.ret.var)
 

@@ -134,7 +134,7 @@ class ParameterAveraging(Federation):
     def protects_uploads(self) -> bool:
         return self._privacy.has_noise
 
-    def upload_figures(self, public: bool = False) -> dict[str, float]:
+    def upload_metrics(self, public: bool = False) -> dict[str, float]:
         return self._privacy.figures(public) if self._privacy.is_on else {}
 
     def upload_summary(self) -> dict[str, Any]:

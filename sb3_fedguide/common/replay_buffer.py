@@ -134,7 +134,7 @@ class FederatedReplayBuffer(ReplayBuffer):
         client = np.arange(self.n_clients)[:, None]
         rewards = self.rewards[index, client]
         if normalizer.norm_reward:
-            scaled = rewards / normalizer.reward_deviation[:, None]
+            scaled = rewards / normalizer.reward_std[:, None]
             rewards = np.clip(scaled, -normalizer.CLIP, normalizer.CLIP).astype(np.float32)
         arrays = (
             normalizer.normalize_obs(self.observations[index, client]),

@@ -39,13 +39,13 @@ def record_training(model: FederatedPPO, statistics: RoundStatistics, schedules:
     means = statistics.means()
     values, returns = buffer.rows(buffer.values), buffer.rows(buffer.returns)
     means["explained_variance"] = np.array([explained_variance(v, r) for v, r in zip(values, returns, strict=True)])
-    told = ["approx_kl", "explained_variance", "grad_norm"]
+    names = ["approx_kl", "explained_variance", "grad_norm"]
     if model.policy.log_std is not None:
         means["std"] = model.policy.log_std.detach().exp().mean(dim=1).cpu().numpy()
-        told.append("std")
+        names.append("std")
     for name, per_client in means.items():
         model.logger.record(f"train/{name}", float(np.mean(per_client[model.present])))
-    for name in told:
+    for name in names:
         for index in np.flatnonzero(model.present):
             model.record_client(model.client_ids[index], name, float(means[name][index]))
     model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")

@@ -64,7 +64,7 @@ def optimal_blend(returns: np.ndarray, online: np.ndarray, dice: np.ndarray) -> 
     return 1 - np.clip(share, 0.0, 1.0)
 
 
-def baseline_figures(returns: np.ndarray, online: np.ndarray, dice: np.ndarray, blend: np.ndarray) -> dict[str, np.ndarray]:
+def baseline_metrics(returns: np.ndarray, online: np.ndarray, dice: np.ndarray, blend: np.ndarray) -> dict[str, np.ndarray]:
     """How much of the returns each baseline explains, and the quantities of the paper's Lemma 2, ``(n_clients,)`` each.
 
     :param returns: Monte Carlo returns G, ``(n_clients, n_rows)``, like the three baselines

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 Facts = dict[str, Any]
 
 #: What a run is, whatever version goes on with it.
-OF_A_RUN = ("algorithm", "seed", "n_rounds", "rollout_size", "settings")
+RUN_FACTS = ("algorithm", "seed", "n_rounds", "rollout_size", "settings")
 #: Of what client and server both state; it has to be the same.
-WITH_SERVER = ("version", *OF_A_RUN)
+SERVER_FACTS = ("version", *RUN_FACTS)
 #: Of what only clients know; it has to be what most of those say with whom the run began.
-AMONG_CLIENTS = ("shapes", "trunk")
+CLIENT_FACTS = ("shapes", "trunk")
 
 
 def server_facts(config: ServerConfig) -> Facts:
@@ -68,21 +68,21 @@ class Clients:
         #: what clients have to have in common, known when the run has begun
         self.common: Facts | None = None
 
-    def newcomers(self, there: Collection[int]) -> list[int]:
+    def newcomers(self, present: Collection[int]) -> list[int]:
         """Who has to be asked; a refused client is asked again when it has been away."""
-        self.refused = {client: reason for client, reason in self.refused.items() if client in there}
-        return sorted(set(there) - self.joined.keys() - self.refused.keys())
+        self.refused = {client: reason for client, reason in self.refused.items() if client in present}
+        return sorted(set(present) - self.joined.keys() - self.refused.keys())
 
     def join(self, client: int, facts: Facts) -> str | None:
         """Take a client's answer.
 
         :return: why the client is refused, if it is
         """
-        kept = {name: facts.get(name) for name in (*WITH_SERVER, *AMONG_CLIENTS)}
+        kept = {name: facts.get(name) for name in (*SERVER_FACTS, *CLIENT_FACTS)}
         reason = None if facts.get("client") == client else f"it says that it is client {_short(facts.get('client'))}"
-        reason = reason or difference(kept, self.facts, WITH_SERVER, "the server's")
+        reason = reason or difference(kept, self.facts, SERVER_FACTS, "the server's")
         if reason is None and self.common is not None:
-            reason = difference(kept, self.common, AMONG_CLIENTS, "the other clients'")
+            reason = difference(kept, self.common, CLIENT_FACTS, "the other clients'")
         if reason is None:
             self.joined[client] = kept
         else:
@@ -102,7 +102,7 @@ class Clients:
             return {}
         self.common = json.loads(usual)
         odd = {
-            client: difference(self.joined[client], json.loads(usual), AMONG_CLIENTS, "most others'") or ""
+            client: difference(self.joined[client], json.loads(usual), CLIENT_FACTS, "most others'") or ""
             for client, text in said.items()
             if text != usual
         }
@@ -121,7 +121,7 @@ class Clients:
 
 
 def _text(facts: Facts) -> str:
-    return json.dumps({name: facts[name] for name in AMONG_CLIENTS}, sort_keys=True)
+    return json.dumps({name: facts[name] for name in CLIENT_FACTS}, sort_keys=True)
 
 
 def _short(value: Any) -> str:

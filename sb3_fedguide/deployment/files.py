@@ -114,7 +114,7 @@ class ServerDeployment:
         except TypeError as error:
             raise ValueError(f"{path}: one of the settings {given} has the wrong type: {error}") from None
 
-    def told(self) -> dict[str, Any]:
+    def process_settings(self) -> dict[str, Any]:
         """What the process of the round loop reads."""
         return {"server": asdict(self.server), "clients": self.clients, "folder": str(self.folder)}
 
@@ -143,7 +143,7 @@ class ClientDeployment:
             given["conf"] = _conf(given["conf"], base)
         self.site = given
 
-    def told(self) -> dict[str, Any]:
+    def process_settings(self) -> dict[str, Any]:
         """What the process that answers a message reads."""
         return {"site": self.site, "folder": str(self.folder)}
 

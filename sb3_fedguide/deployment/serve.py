@@ -13,20 +13,20 @@ from dataclasses import replace
 from pathlib import Path
 
 from fed_envs.plain_data import State, freeze, thaw
-from sb3_fedguide.deployment.clients import OF_A_RUN, Clients, difference, server_facts
+from sb3_fedguide.deployment.clients import RUN_FACTS, Clients, difference, server_facts
 from sb3_fedguide.deployment.config import ServerConfig, TooFewClients
 from sb3_fedguide.deployment.transport import RUN, UNPREPARED, Failure, Kind, Message, Transport
 from sb3_fedguide.server.build import make_strategy
-from sb3_fedguide.server.metrics import EvaluationTable, count_tests, evaluation_figures, merge_figures, read_evaluations
+from sb3_fedguide.server.metrics import EvaluationTable, count_tests, evaluation_metrics, merge_metrics, read_evaluations
 from sb3_fedguide.server.payload import Payload
-from sb3_fedguide.server.rounds import Rounds, participants, payload_bytes, rejections
+from sb3_fedguide.server.rounds import Coordinator, participants, payload_bytes, rejections
 from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_fault
 from sb3_fedguide.state.checkpoint_files import newest_checkpoint, remove_leftovers, write_checkpoint
 
 logger = logging.getLogger(__name__)
 
 #: What of the server a checkpoint holds as it is.
-_ATTRIBUTES = ("run_id", "round", "timesteps", "test_steps", "n_broadcasts", "n_setups", "outbox", "finished", "told")
+_ATTRIBUTES = ("run_id", "round", "timesteps", "test_steps", "n_broadcasts", "n_setups", "outbox", "finished", "dismissed")
 __all__ = ["Server", "ServerConfig", "TooFewClients", "serve"]
 
 CHECKPOINTS = "checkpoints"
@@ -69,11 +69,11 @@ class Server:
         self.folder = None if folder is None else Path(folder)
         strategy = make_strategy(config.algorithm, config.settings, config.n_clients, config.seed)
         #: the strategy, who is outdated, and bytes
-        self.rounds = Rounds(strategy)
+        self.coordinator = Coordinator(strategy)
         #: who has joined, who was refused, who is ready to train
         self.clients = Clients(server_facts(config))
         #: who was there at the last look
-        self.there: set[int] = set()
+        self.present: set[int] = set()
         self.trunk: TrunkAverages | None = None
         #: complete rounds
         self.round = 0
@@ -91,7 +91,7 @@ class Server:
         self.n_setups = 0
         self.finished = False
         #: who has heard that the run is over
-        self.told: list[int] = []
+        self.dismissed: list[int] = []
         self._table = EvaluationTable(None if self.folder is None else self.folder / EVALUATIONS)
 
     def run(self) -> None:
@@ -101,7 +101,7 @@ class Server:
             self._await_clients()
             self._pretrain_trunk()
             self._prepare()
-            while self.rounds.needs_setup:
+            while self.coordinator.needs_setup:
                 self._set_up()
             while self.round < self.config.n_rounds:
                 self._play_round()
@@ -118,11 +118,11 @@ class Server:
 
     def _welcome(self) -> None:
         """Look who is there, and ask those who are new for their settings."""
-        self.there = set(self.transport.clients())
-        newcomers = self.clients.newcomers(self.there)
+        self.present = set(self.transport.clients())
+        newcomers = self.clients.newcomers(self.present)
         requests = {client: Message("join", 0, facts=self.clients.facts) for client in newcomers}
         refused = {}
-        for client, reply in self._exchange(requests, self.config.timeout).items():
+        for client, reply in self._ask(requests, self.config.timeout).items():
             reason = self.clients.join(client, reply.facts)
             if reason is not None:
                 refused[client] = reason
@@ -167,12 +167,12 @@ class Server:
 
     def _to_joined(self, request: Message, members: Iterable[int] | None = None) -> dict[int, Message]:
         self._welcome()
-        there = self.there & self.clients.joined.keys()
+        there = self.present & self.clients.joined.keys()
         return {client: request for client in sorted(there if members is None else there & set(members))}
 
     def _count_trunk(self, replies: Mapping[int, Message], sent: Payload) -> None:
         uploads = {client: reply.payload for client, reply in replies.items()}
-        self.rounds.count(payload_bytes(uploads), payload_bytes(dict.fromkeys(replies, sent)), offline=True)
+        self.coordinator.count(payload_bytes(uploads), payload_bytes(dict.fromkeys(replies, sent)), offline=True)
 
     def _preparations(self) -> dict[int, Message]:
         """Requests to those who have not been through the offline stage."""
@@ -183,7 +183,7 @@ class Server:
         """The local part of the offline stage."""
         started = time.monotonic()
         while True:
-            for client in self._exchange(self._preparations(), self.config.setup_timeout):
+            for client in self._ask(self._preparations(), self.config.setup_timeout):
                 self._note_prepared(client)
             if len(self._there()) >= self.config.min_clients:
                 return self._save()
@@ -214,13 +214,13 @@ class Server:
 
         replies = self._collect(requests, config.timeout)
         facts = {client: reply.facts for client, reply in replies.items()}
-        figures, earlier = merge_figures(facts), self.timesteps[-1] if self.timesteps else 0
+        figures, earlier = merge_metrics(facts), self.timesteps[-1] if self.timesteps else 0
         self.timesteps.append(earlier + config.rollout_size * len(replies) + count_tests(facts, self.test_steps))
         exchanged = time.perf_counter()
         self._aggregate(round, replies)
         self.round = round
-        figures |= self.rounds.figures
-        figures |= {f"client_{client}/rejected": 1.0 for client in self.rounds.rejected}
+        figures |= self.coordinator.metrics
+        figures |= {f"client_{client}/rejected": 1.0 for client in self.coordinator.rejected}
         figures["federated/participants"], figures["federated/failed"] = len(replies), len(self.failures)
         figures["time/exchange"] = time.perf_counter() - exchanged
         figures["time/round"], figures["time/server_round"] = round, time.perf_counter() - started
@@ -230,20 +230,20 @@ class Server:
     def _finish(self) -> None:
         """Deliver what was sent last, and wait a while for those who are away; started again, it does so for who is left."""
         started = time.monotonic()
-        while away := self.clients.prepared.difference(self.told):
+        while away := self.clients.prepared.difference(self.dismissed):
             self._welcome()
             requests = self._to_prepared("finish", self.config.n_rounds, sorted(away.intersection(self._there())))
-            replies = self._exchange(requests, self.config.timeout)
+            replies = self._ask(requests, self.config.timeout)
             for client in replies:
                 self.outbox.pop(client, None)
-            self.told += replies
+            self.dismissed += replies
             is_late, self.finished = self.finished, True
             if replies or not is_late:
                 self._report(self.config.n_rounds, replies, None if is_late else {})  # an average is not of the late alone
             if time.monotonic() - started >= self.config.finish_timeout:
                 break
-            time.sleep(self.config.poll if away.difference(self.told) else 0.0)
-        if away := self.clients.prepared.difference(self.told):
+            time.sleep(self.config.poll if away.difference(self.dismissed) else 0.0)
+        if away := self.clients.prepared.difference(self.dismissed):
             logger.warning("clients %s have not heard that the run is over; start the server again for them", sorted(away))
 
     def _report(self, round: int, replies: Mapping[int, Message], figures: dict[str, float] | None) -> None:
@@ -255,20 +255,20 @@ class Server:
             if 0 < evaluation.round <= round
         ]
         self._table.add(evaluations, self.timesteps)
-        if self.on_round is not None and figures is not None and (figures := figures | evaluation_figures(evaluations)):
+        if self.on_round is not None and figures is not None and (figures := figures | evaluation_metrics(evaluations)):
             self.on_round(round, {**figures, "time/total_timesteps": self.timesteps[-1]})
         self._save()
 
     def _aggregate(self, round: int, replies: Mapping[int, Message]) -> None:
-        if self.rounds.strategy is None:
+        if self.coordinator.strategy is None:
             return
         uploads = {client: reply.payload for client, reply in replies.items()}
-        broadcasts = self.rounds.exchange(round, uploads, self.clients.prepared - uploads.keys())
+        broadcasts = self.coordinator.exchange(round, uploads, self.clients.prepared - uploads.keys())
         self.n_broadcasts += any(broadcasts.values())
         for client, broadcast in broadcasts.items():
             if broadcast:
                 self.outbox[client] = (self.n_broadcasts, round, broadcast)
-        self._warn(self.rounds.complaints)
+        self._warn(self.coordinator.complaints)
 
     def _warn(self, complaints: Iterable[str]) -> None:
         for complaint in complaints:
@@ -276,14 +276,14 @@ class Server:
 
     def _there(self) -> list[int]:
         """Who was there at the last look and is ready to train."""
-        return sorted(self.there & self.clients.prepared & self.clients.joined.keys())
+        return sorted(self.present & self.clients.prepared & self.clients.joined.keys())
 
     def _to_prepared(self, kind: Kind, round: int, clients: Iterable[int]) -> dict[int, Message]:
         """Requests with what each client has missed."""
         requests = {}
         for client in clients:
-            if client in self.rounds.outdated:
-                self.outbox[client] = (self.n_broadcasts, 0, self.rounds.catch_up(client))
+            if client in self.coordinator.outdated:
+                self.outbox[client] = (self.n_broadcasts, 0, self.coordinator.catch_up(client))
             number, after, payload = self.outbox.get(client, (0, 0, {}))
             requests[client] = Message(kind, round, payload, {"broadcast": number, "after": after})
         return requests
@@ -302,7 +302,7 @@ class Server:
         started, replies = time.monotonic(), {}
         while True:
             asked = {client: request for client, request in requests().items() if client not in replies}
-            for client, reply in self._exchange(asked, timeout, fault).items():
+            for client, reply in self._ask(asked, timeout, fault).items():
                 if asked[client].kind == "setup" and asked[client].round == 0:
                     self._note_prepared(client)
                 else:
@@ -312,7 +312,7 @@ class Server:
                 return replies
             self._pause(started, len(replies), self.config.min_clients)
 
-    def _exchange(
+    def _ask(
         self, requests: Mapping[int, Message], timeout: float | None, fault: Callable[[Message], str | None] | None = None
     ) -> dict[int, Message]:
         """The replies that came; of the others it is noted why they did not."""
@@ -321,7 +321,7 @@ class Server:
         requests = {
             client: replace(request, facts={**request.facts, RUN: self.run_id}) for client, request in requests.items()
         }
-        answers, replies = self.transport.exchange(requests, timeout), {}
+        answers, replies = self.transport.send_and_receive(requests, timeout), {}
         for client, request in requests.items():
             answer = answers.get(client, Failure("gone"))
             if isinstance(answer, Message):
@@ -344,7 +344,7 @@ class Server:
     def _note_prepared(self, client: int) -> None:
         self.clients.prepared.add(client)
         if self.n_broadcasts > 0:  # it has missed what the others received
-            self.rounds.outdated.add(client)
+            self.coordinator.outdated.add(client)
 
     def _pause(self, started: float, have: int, need: int) -> None:
         """Wait before the next look.
@@ -363,10 +363,10 @@ class Server:
         state: State = {
             "server": self.clients.facts,
             "attributes": freeze({name: getattr(self, name) for name in _ATTRIBUTES}),
-            "outdated": sorted(self.rounds.outdated),
-            "bytes": self.rounds.bytes_counted,
+            "outdated": sorted(self.coordinator.outdated),
+            "bytes": self.coordinator.bytes_counted,
             "clients": self.clients.save_state(),
-            "strategy": None if self.rounds.strategy is None else self.rounds.strategy.save_state(),
+            "strategy": None if self.coordinator.strategy is None else self.coordinator.strategy.save_state(),
             "trunk": None if self.trunk is None else self.trunk.save_state(),
             "table_size": self._table.size,
         }
@@ -384,15 +384,15 @@ class Server:
         if found is None:
             return
         path, state = found
-        if other := difference(state["server"], self.clients.facts, OF_A_RUN, "this server's"):
+        if other := difference(state["server"], self.clients.facts, RUN_FACTS, "this server's"):
             raise ValueError(f"{path} is the checkpoint of another federation: {other}; give this one a folder of its own")
         for name, value in thaw(state["attributes"]).items():
             setattr(self, name, value)
-        self.rounds.outdated = set(state["outdated"])
-        self.rounds.bytes_counted = state["bytes"]
+        self.coordinator.outdated = set(state["outdated"])
+        self.coordinator.bytes_counted = state["bytes"]
         self.clients.load_state(state["clients"])
-        if self.rounds.strategy is not None:
-            self.rounds.strategy.load_state(state["strategy"])
+        if self.coordinator.strategy is not None:
+            self.coordinator.strategy.load_state(state["strategy"])
         self.trunk = None if state["trunk"] is None else TrunkAverages.from_state(state["trunk"])
         self._table.cut(state["table_size"])
         logger.info("going on after round %d", self.round)

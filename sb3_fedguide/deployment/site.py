@@ -18,7 +18,7 @@ from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.evaluation import Evaluation, FederatedEvalCallback, evaluation_env
 from sb3_fedguide.common.faults import in_round
 from sb3_fedguide.common.federation import Federation
-from sb3_fedguide.deployment.clients import OF_A_RUN, WITH_SERVER, difference
+from sb3_fedguide.deployment.clients import RUN_FACTS, SERVER_FACTS, difference
 from sb3_fedguide.deployment.transport import KINDS, RUN, UNPREPARED, Message
 from sb3_fedguide.offline.trunk import TrunkTraining, observation_moments
 from sb3_fedguide.registry import algorithm_name
@@ -167,7 +167,7 @@ class Site:
     def _join(self, message: Message) -> Message:
         """Nothing of it stays: a client that is refused can be put right in the same folder."""
         facts = self.facts()
-        if other := difference(facts, message.facts, WITH_SERVER, "the server's"):
+        if other := difference(facts, message.facts, SERVER_FACTS, "the server's"):
             logger.warning("the server will refuse client %d: %s", self.client_id, other)
         return Message("join", message.round, facts=facts)
 
@@ -211,9 +211,9 @@ class Site:
         if self._evaluation is not None and self._evaluation.is_due(message.round):
             evaluations.append(self._evaluated("deployed", message.round))
         payload = model.outgoing(0)
-        figures = model.upload_figures(public=model.protects_uploads)
+        figures = model.upload_metrics(public=model.protects_uploads)
         if self._report:
-            figures = {**self._log.figures, **figures}
+            figures = {**self._log.metrics, **figures}
         facts: dict[str, Any] = {"figures": figures, "evaluations": evaluations}
         if model.test_steps and not model.protects_uploads:
             facts["test_steps"] = model.test_steps
@@ -289,7 +289,7 @@ class Site:
             return
         path, state = found
         identity = self._identity()
-        if other := difference(thaw(state["identity"]), identity, OF_A_RUN, "here"):
+        if other := difference(thaw(state["identity"]), identity, RUN_FACTS, "here"):
             raise ValueError(f"{path} is of another run: {other}; give this one a folder of its own")
         self.n_answered = int(path.stem.removeprefix("round_"))
         self.run, self.n_received = state["run"], state["n_received"]
@@ -321,11 +321,11 @@ class _LastLog(KVWriter):
     """Keeps the numbers of the last log that was written."""
 
     def __init__(self) -> None:
-        self.figures: dict[str, float] = {}
+        self.metrics: dict[str, float] = {}
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         numbers = {key: value for key, value in key_values.items() if isinstance(value, (int, float, np.number))}
-        self.figures = {key: float(value) for key, value in numbers.items() if math.isfinite(value)}
+        self.metrics = {key: float(value) for key, value in numbers.items() if math.isfinite(value)}
 
     def close(self) -> None:
         pass

@@ -70,7 +70,7 @@ class Transport(Protocol):
         """Ids of the clients that are there now."""
         ...
 
-    def exchange(self, requests: Mapping[int, Message], timeout: float | None) -> dict[int, Message | Failure]:
+    def send_and_receive(self, requests: Mapping[int, Message], timeout: float | None) -> dict[int, Message | Failure]:
         """Send each client its request, and wait until all are answered or have failed.
 
         :param requests: by client id

@@ -138,7 +138,7 @@ class Engine(ABC):
         excluded: dict[str, Any] = {}
         for k, reply in replies.items():
             n_present = int(model.present[self.groups[k]].sum())
-            for key, (value, outputs) in reply.figures.items():
+            for key, (value, outputs) in reply.metrics.items():
                 values.setdefault(key, []).append((value, n_present))
                 excluded[key] = outputs
         for key, entries in values.items():

@@ -34,10 +34,10 @@ class Processes(Engine):
         os.environ["OMP_NUM_THREADS"] = "1"
         try:
             for blob in blobs:
-                here, there = context.Pipe()
-                process = context.Process(target=_work, args=(there, blob), daemon=True)
+                here, other = context.Pipe()
+                process = context.Process(target=_work, args=(other, blob), daemon=True)
                 process.start()
-                there.close()
+                other.close()
                 self._pipes.append(here)
                 self._processes.append(process)
         finally:

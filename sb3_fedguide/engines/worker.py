@@ -35,13 +35,13 @@ class Trained(NamedTuple):
     """What comes back.
 
     :param state: of its clients, after the round
-    :param figures: what was logged, with the outputs that each value is kept from
+    :param metrics: what was logged, with the outputs that each value is kept from
     :param restarted: clients whose episodes had to begin anew
     :param observations: what the actors saw, ``(n_steps, n_clients, n_envs, obs_dim)``; ``None`` off policy
     """
 
     state: State
-    figures: dict[str, tuple[float, Any]]
+    metrics: dict[str, tuple[float, Any]]
     observations: np.ndarray | None
     restarted: list[int]
 
@@ -86,9 +86,9 @@ class Worker:
         except ClientError as error:
             return error
         excluded = model.logger.name_to_excluded
-        figures = {key: (value, excluded[key]) for key, value in model.logger.name_to_value.items()}
+        metrics = {key: (value, excluded[key]) for key, value in model.logger.name_to_value.items()}
         buffer = getattr(model, "rollout_buffer", None)
-        return Trained(model.save_state(), figures, None if buffer is None else buffer.observations, restarted)
+        return Trained(model.save_state(), metrics, None if buffer is None else buffer.observations, restarted)
 
 
 def describe(model: Federation, positions: Sequence[int]) -> bytes:

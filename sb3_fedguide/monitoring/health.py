@@ -23,7 +23,7 @@ LARGEST_KL = 0.2
 ONE_EXPERT = 0.99
 
 
-class Symptom(NamedTuple):
+class HealthCheck(NamedTuple):
     """Something that goes wrong with clients one by one.
 
     :param key: what is logged of each client, after ``client_<k>/``
@@ -51,20 +51,20 @@ def _kl_remedy(model: Federation) -> str:
     return f"a smaller learning_rate, fewer n_epochs (now {model.n_epochs}){trust}, or normalize=True"
 
 
-SYMPTOMS = (
-    Symptom(
+HEALTH_CHECKS = (
+    HealthCheck(
         "effective_sample_share",
         lambda share: share < LEAST_SAMPLE_SHARE,
         "the importance weights have collapsed onto a few states, so that the prior term is noise",
         lambda model: 'prior_loss="sample", which needs no weights',
     ),
-    Symptom(
+    HealthCheck(
         "explained_variance_dice",
         lambda explained: explained < LEAST_EXPLAINED_VARIANCE,
         "V_phi has a negative explained variance: as a baseline it is worse than a constant",
         _dice_remedy,
     ),
-    Symptom(
+    HealthCheck(
         "approx_kl",
         lambda kl: kl > LARGEST_KL,
         "the KL from the policy that acted has exploded: the rollout says little about the policy it led to",
@@ -84,14 +84,14 @@ def routes_one_to_one(rows: np.ndarray) -> bool:
 
 
 class HealthCallback(RoundCallback):
-    """Warns of what goes wrong with a run: once of each symptom and client, however long it lasts.
+    """Warns of what goes wrong with a run: once of each check and client, however long it lasts.
 
     The values are those of the log, per client; nothing of the training changes. A run that was resumed warns again.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self._told: set[tuple[str, int]] = set()
+        self._warned: set[tuple[str, int]] = set()
 
     def _on_round_end(self) -> None:
         for problem in self._problems():
@@ -99,20 +99,20 @@ class HealthCallback(RoundCallback):
 
     def _problems(self) -> Iterator[str]:
         model, logged = self.model, self.logger.name_to_value
-        for symptom in SYMPTOMS:
-            values = {client: float(logged.get(f"client_{client}/{symptom.key}", np.nan)) for client in model.client_ids}
-            ill = [k for k, value in values.items() if symptom.is_wrong(value) and (symptom.key, k) not in self._told]
+        for check in HEALTH_CHECKS:
+            values = {client: float(logged.get(f"client_{client}/{check.key}", np.nan)) for client in model.client_ids}
+            ill = [k for k, value in values.items() if check.is_wrong(value) and (check.key, k) not in self._warned]
             if ill:
-                self._told |= {(symptom.key, client) for client in ill}
-                told = ", ".join(f"client {client} ({symptom.key} {values[client]:.3g})" for client in ill)
-                yield f"{told}: {symptom.reason}; try {symptom.remedy(model)}"
+                self._warned |= {(check.key, client) for client in ill}
+                clients = ", ".join(f"client {client} ({check.key} {values[client]:.3g})" for client in ill)
+                yield f"{clients}: {check.reason}; try {check.remedy(model)}"
         if (
             isinstance(model, FedGuide)
             and (model.family is None or model.family.world != "bandit2d")  # whose priors are peaks far apart
-            and ("plan", 0) not in self._told
+            and ("plan", 0) not in self._warned
             and routes_one_to_one(model.mixture_rows[model.present])
         ):
-            self._told.add(("plan", 0))
+            self._warned.add(("plan", 0))
             yield (
                 "the transport plan is a permutation: every client keeps to an expert of its own, and nothing of priors is "
                 f"shared; try a larger eta (now {model.eta:g}), or an n_experts below the number of clients"

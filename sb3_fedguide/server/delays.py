@@ -157,7 +157,7 @@ class Delays:
         #: who finished a round, heard or not, in the server's last round
         self.finished = np.zeros(n, dtype=bool)
         #: figures of the last round, by log key
-        self.figures: dict[str, float] = {}
+        self.metrics: dict[str, float] = {}
 
     @property
     def keep_busy(self) -> bool:
@@ -213,9 +213,9 @@ class Delays:
             self.seconds = max(self.seconds, float(self.idle_at.min()))  # until somebody can begin the next round
         self.finished = self.training & self.idle
         self.training &= ~self.finished
-        self.figures = {"federated/simulated_seconds": self.seconds, "federated/arrived": float(arrived.sum())}
+        self.metrics = {"federated/simulated_seconds": self.seconds, "federated/arrived": float(arrived.sum())}
         if arrived.any():
-            self.figures["federated/staleness"] = float(np.mean(self.rounds - self.began_in[arrived]))
+            self.metrics["federated/staleness"] = float(np.mean(self.rounds - self.began_in[arrived]))
         self.rounds += 1
         return arrived
 

@@ -87,11 +87,11 @@ def count_tests(facts: Mapping[int, Mapping[str, Any]], counted: dict[int, int])
     return new
 
 
-def merge_figures(facts: Mapping[int, Mapping[str, Any]]) -> dict[str, float]:
+def merge_metrics(facts: Mapping[int, Mapping[str, Any]]) -> dict[str, float]:
     """One log of all clients': ``client_<k>/...`` is taken from client k, everything else averaged over those that say it,
     but for :data:`~sb3_fedguide.server.payload.EPSILON`, the largest.
 
-    Keys of evaluations are left out: :func:`evaluation_figures` makes them of the episodes.
+    Keys of evaluations are left out: :func:`evaluation_metrics` makes them of the episodes.
     """
     merged: dict[str, float] = {}
     shared: dict[str, list[float]] = {}
@@ -113,7 +113,7 @@ def merge_figures(facts: Mapping[int, Mapping[str, Any]]) -> dict[str, float]:
     return {**{key: float(np.max(values) if key == EPSILON else np.mean(values)) for key, values in shared.items()}, **merged}
 
 
-def evaluation_figures(evaluations: Iterable[ClientEvaluation]) -> dict[str, float]:
+def evaluation_metrics(evaluations: Iterable[ClientEvaluation]) -> dict[str, float]:
     """The clients' average and the worst client, under the keys that a federation in process logs."""
     figures: dict[str, float] = {}
     by_policy: dict[str, list[ClientEvaluation]] = {}

@@ -12,7 +12,7 @@ from sb3_fedguide.server.strategy import Strategy
 from sb3_fedguide.settings.participants import n_participants
 
 
-class Rounds:
+class Coordinator:
     """Knows who has missed an exchange, counts bytes, and calls the strategy.
 
     :param strategy: the method's; ``None`` where nothing is exchanged
@@ -30,7 +30,7 @@ class Rounds:
         self.complaints: list[str] = []
         self._doubted: set[int] = set()
         #: figures of the last exchange, by log key
-        self.figures: dict[str, float] = {}
+        self.metrics: dict[str, float] = {}
 
     @property
     def needs_setup(self) -> bool:
@@ -69,13 +69,13 @@ class Rounds:
         self.complaints += [f"the upload of client {k} is used, but looks wrong: {why}" for k, why in doubts.items()]
         up, down = payload_bytes(uploads), payload_bytes(broadcasts)
         self.count(up, down, offline=round == 0)
-        self.figures = {f"federated/{key}": value for key, value in self.strategy.metrics.items()}
+        self.metrics = {f"federated/{key}": value for key, value in self.strategy.metrics.items()}
         for name, values in self.strategy.client_metrics.items():
-            self.figures |= {f"client_{client}/{name}": value for client, value in values.items()}
-        self.figures["federated/bytes_up"] = up
-        self.figures["federated/bytes_down"] = down
-        self.figures["federated/bytes_total"] = self.bytes_up + self.bytes_down
-        self.figures["federated/bytes_offline"] = self.offline_bytes_up + self.offline_bytes_down
+            self.metrics |= {f"client_{client}/{name}": value for client, value in values.items()}
+        self.metrics["federated/bytes_up"] = up
+        self.metrics["federated/bytes_down"] = down
+        self.metrics["federated/bytes_total"] = self.bytes_up + self.bytes_down
+        self.metrics["federated/bytes_offline"] = self.offline_bytes_up + self.offline_bytes_down
         return broadcasts
 
     def count(self, up: int, down: int, offline: bool) -> None:

@@ -28,10 +28,10 @@ def answer(message: FlowerMessage, context: Context) -> FlowerMessage:
         request = from_records(message.content)
         if isinstance(request, Failure):
             raise ValueError(f"the server sent a failure: {request.reason}")
-        told = json.loads(Path(str(context.node_config["config"])).read_text(encoding="utf-8"))
-        reply = make_site(told["site"], Path(told["folder"]) / SITE).handle(request)
+        settings = json.loads(Path(str(context.node_config["config"])).read_text(encoding="utf-8"))
+        reply = make_site(settings["site"], Path(settings["folder"]) / SITE).handle(request)
         if request.kind == "finish":
-            (Path(told["folder"]) / FINISHED).touch()
+            (Path(settings["folder"]) / FINISHED).touch()
     except Exception as error:
         traceback.print_exc()
         reply = Failure.of(error)

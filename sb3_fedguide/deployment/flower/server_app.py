@@ -35,12 +35,12 @@ def main(grid: Grid, context: Context) -> None:
     :raises SystemExit: with code 2 where the configuration or the folder is wrong, 1 where there were too few clients
     """
     set_up_journal()
-    told = json.loads(Path(os.environ[CONFIG]).read_text(encoding="utf-8"))
-    clients = {read_public_key(text): int(client) for client, text in told["clients"].items()}
-    log = RoundLog(Path(told["folder"]) / "tb")
+    settings = json.loads(Path(os.environ[CONFIG]).read_text(encoding="utf-8"))
+    clients = {read_public_key(text): int(client) for client, text in settings["clients"].items()}
+    log = RoundLog(Path(settings["folder"]) / "tb")
     try:
-        serve(ServerConfig(**told["server"]), FlowerTransport(grid, clients), told["folder"], log)
-        (Path(told["folder"]) / FINISHED).touch()
+        serve(ServerConfig(**settings["server"]), FlowerTransport(grid, clients), settings["folder"], log)
+        (Path(settings["folder"]) / FINISHED).touch()
     except TooFewClients as error:
         logger.error("%s; the next start goes on from the last checkpoint", error)
         sys.exit(EXIT_FAILED)

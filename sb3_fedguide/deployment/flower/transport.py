@@ -38,7 +38,7 @@ class FlowerTransport:
     def clients(self) -> list[int]:
         return sorted(self._nodes())
 
-    def exchange(self, requests: Mapping[int, Message], timeout: float | None) -> dict[int, Message | Failure]:
+    def send_and_receive(self, requests: Mapping[int, Message], timeout: float | None) -> dict[int, Message | Failure]:
         limit = _NO_LIMIT if timeout is None else min(timeout, _NO_LIMIT)
         until = time.monotonic() + limit
         nodes = self._nodes()
