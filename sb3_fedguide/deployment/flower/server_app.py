@@ -77,7 +77,8 @@ class RoundLog:
             "reward": "rollout/ep_rew_mean", "evaluation": "eval/mean_reward", "seconds": "time/server_round",
         }  # fmt: skip
         values = [f"{name} {figures[key]:.4g}" for name, key in shown.items() if key in figures]
-        logger.info("round %d: %s", round, ", ".join(values))
+        if values:  # after the last round, clients report their evaluations of what it sent
+            logger.info("round %d: %s", round, ", ".join(values))
 
     def close(self) -> None:
         self._writer.close()
