@@ -37,7 +37,7 @@ def test_a_run_with_its_log_and_its_table(tmp_path):
     last = rows[-1]
     assert last["train/loss"] == 1.5 and last["client_2/std"] == 1.0 and "client_99/std" not in last
     assert last["federated/participants"] == 4 and last["time/total_timesteps"] == 5 * 4 * 8
-    assert last["federated/bytes_total"] == 5 * 4 * (16 + 12) == server.rounds.bytes_up + server.rounds.bytes_down
+    assert last["federated/bytes_total"] == 5 * 4 * (16 + 12) == server.coordinator.bytes_up + server.coordinator.bytes_down
     assert last["eval/mean_reward"] == 1.5 and last["eval/worst_client"] == 0 and last["eval/mean_ep_length"] == 7
     table = (tmp_path / "evaluations.csv").read_text().splitlines()
     assert table[0] == "round,timesteps,policy,client,mean_return,std_return,mean_length,success_rate"
@@ -89,7 +89,7 @@ def test_a_client_that_is_away_for_a_while_and_one_that_comes_late_are_welcome()
     _, server, rows = run(replaced(CONFIG, start_clients=2), transport)
     assert transport.site(2).trained == [4, 5] and transport.site(1).trained == [1, 2, 5]
     assert [row["federated/participants"] for row in rows] == [2, 2, 1, 2, 3]
-    assert sorted(server.clients.joined) == [0, 1, 2] and server.rounds.outdated == set()
+    assert sorted(server.clients.joined) == [0, 1, 2] and server.coordinator.outdated == set()
     for client, round in ((2, 4), (1, 5)):  # both begin with what the others have
         np.testing.assert_array_equal(received[client, round], received[0, round])
     thetas = [transport.site(client).theta for client in range(3)]
@@ -227,7 +227,7 @@ def test_without_exchange_there_are_logs_and_nothing_else(tmp_path):
     config = replaced(CONFIG, algorithm="local")
     own = {"algorithm": "local", "settings": complete_settings("local", {})}
     transport, server, rows = run(config, LoopTransport(lambda client: Client(client, **own), [0, 1, 2, 3]), tmp_path)
-    assert server.rounds.strategy is None and rows[-1]["train/loss"] == 1.5 and "federated/bytes_up" not in rows[-1]
+    assert server.coordinator.strategy is None and rows[-1]["train/loss"] == 1.5 and "federated/bytes_up" not in rows[-1]
     assert not np.array_equal(transport.site(0).theta, transport.site(1).theta)
 
 
@@ -253,7 +253,7 @@ def test_a_server_that_is_killed_goes_on_to_the_same_end(kind, round, before, tm
     for client in range(4):
         np.testing.assert_array_equal(transport.site(client).theta, expected())
         assert transport.site(client).trained == [1, 2, 3, 4, 5]
-    assert server.rounds.bytes_up == 5 * 4 * 16 and server.rounds.bytes_down == 5 * 4 * 12
+    assert server.coordinator.bytes_up == 5 * 4 * 16 and server.coordinator.bytes_down == 5 * 4 * 12
     assert len((tmp_path / "evaluations.csv").read_text().splitlines()) == 21
     assert [row["round"] for row in rows] == [*range(round if kind == "round" else 1, 6)] or kind == "finish"
     assert len(checkpoints(tmp_path / "checkpoints")) == 2
