@@ -1,10 +1,12 @@
 """Federated reinforcement learning for Stable-Baselines3: FedGuide, its baselines, and a Local control.
 
-from sb3_fedguide import FedGuide
+A whole federation is one algorithm::
 
-model = FedGuide("MlpPolicy", "HopperHard", seed=0, tensorboard_log="runs")
-model.learn(total_timesteps=100 * 8 * 4096, progress_bar=True)
-model.client(3)    # client 3 as an ordinary stable_baselines3.PPO
+    from sb3_fedguide import FedAvg
+
+    model = FedAvg("MlpPolicy", "Bandit2D", rollout_size=200, seed=0)
+    model.learn(total_timesteps=2 * 4 * 200)  # two rounds of four clients
+    model.client(3)  # client 3 as an ordinary stable_baselines3.PPO
 """
 
 from __future__ import annotations

@@ -5,12 +5,15 @@ from __future__ import annotations
 import importlib.util
 import re
 import shlex
+import textwrap
 from pathlib import Path
 from types import ModuleType
 
 import gymnasium as gym
 import pytest
 
+import fed_envs
+import sb3_fedguide
 from fed_envs import FAMILIES, load_family
 from sb3_fedguide.cli import benchmark_arguments, deploy, evaluate, export, pull, push
 from sb3_fedguide.cli.arguments import parse_train, train_parser
@@ -189,6 +192,14 @@ def test_a_method_takes_the_actions_that_its_page_names(name):
 def test_the_example_of_a_family_runs(name, families):
     (example,) = blocks(families[f"{name}.md"], "python")
     exec(compile(example, f"{name}.md", "exec"), {"__name__": name})
+
+
+@pytest.mark.parametrize("package", [fed_envs, sb3_fedguide], ids=lambda package: package.__name__)
+def test_the_example_of_a_docstring_runs(package, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    _, _, below = package.__doc__.partition("::\n")
+    example = "\n".join(line for line in below.splitlines() if line.startswith("    ") or not line)
+    exec(compile(textwrap.dedent(example), package.__name__, "exec"), {"__name__": "example"})
 
 
 @pytest.mark.parametrize("page", PROGRAMS, ids=lambda page: page.name)
