@@ -88,7 +88,7 @@ def test_the_wheels_command_trains(environment: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("conf", ["tuned", "paper"])
 def test_the_wheel_has_settings_for_every_method(environment: Path, tmp_path: Path, conf: str) -> None:
     code = (
-        "from sb3_fedguide.algorithms import ALGORITHMS\n"
+        "from sb3_fedguide.registry import ALGORITHMS\n"
         "from sb3_fedguide.settings.config import config_path, read_config\n"
         f"print(*[name for name in ALGORITHMS if read_config(config_path({conf!r}, name))])\n"
     )
