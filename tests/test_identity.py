@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
+import sys
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -129,3 +131,15 @@ def test_a_fork_has_threads_of_its_own():
     hung, _ = child.is_alive(), child.kill()
     child.join()
     assert not hung and child.exitcode == 0
+
+
+def test_an_archive_of_another_version_is_one_message(point_envs, small, tmp_path, monkeypatch):
+    gone = ModuleType("sb3_fedguide.gone")
+    gone.Thing = type("Thing", (), {"__module__": gone.__name__})
+    monkeypatch.setitem(sys.modules, gone.__name__, gone)
+    model = Local("MlpPolicy", point_envs(2), **small)
+    model.thing = gone.Thing()
+    model.save(tmp_path / "model.zip")
+    monkeypatch.delitem(sys.modules, gone.__name__)
+    with pytest.raises(ValueError, match=r"another version .* module sb3_fedguide\.gone; .* import_parameters"):
+        Local.load(tmp_path / "model.zip")

@@ -53,9 +53,17 @@ class FederatedEnvironments(BaseAlgorithm):
         :meth:`import_parameters` reads a file of :meth:`export_parameters` from anybody.
 
         :param env: environments of the same clients; a ``FederatedVecEnv`` may have another number of copies per client
-        :raises ValueError: for environments of other clients or of another family
+        :raises ValueError: for environments of other clients or of another family, and for another version's archive
         """
-        model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        try:
+            model = super().load(path, None, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except ModuleNotFoundError as error:
+            if (error.name or "").partition(".")[0] not in ("sb3_fedguide", "fed_envs"):
+                raise
+            raise ValueError(
+                f"{path} was saved by another version of this package, which has a module {error.name}; make a "
+                f"{cls.__name__} with the same settings and call import_parameters() with the parameters.npz beside it"
+            ) from error
         if env is not None:
             env = model._matching(env)
             if env.n_envs_per_client != model.n_envs_per_client:
