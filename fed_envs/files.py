@@ -57,8 +57,8 @@ class GrowingTable:
         return self.path.stat().st_size if self.path.exists() else None
 
     def begin(self, columns: Sequence[str]) -> None:
-        """Write the header, unless there is a file."""
-        if not self.path.exists():
+        """Write the header, unless there is one."""
+        if not self.size:
             with self.path.open("w", newline="", encoding="utf-8") as file:
                 csv.writer(file).writerow(columns)
 
@@ -72,9 +72,11 @@ class GrowingTable:
     def cut(self, size: int | None) -> None:
         """Forget the rows that were written after the table had ``size`` bytes: they will be written again.
 
+        :param size: ``None`` where there was no table yet
         :raises ValueError: where rows are missing that were there
         """
         if size is None:
+            self.path.unlink(missing_ok=True)
             return
         if (found := self.size or 0) < size:
             raise ValueError(f"{self.path} has {found} bytes and had {size} when the checkpoint was written: rows are missing")

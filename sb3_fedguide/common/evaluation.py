@@ -16,7 +16,7 @@ from fed_envs.state import State, freeze, thaw
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.episodes import truth
 from sb3_fedguide.seeding import EVALUATION_SEED, Role
-from sb3_fedguide.server.metrics import EVALUATION_COLUMNS
+from sb3_fedguide.server.metrics import EVALUATION_COLUMNS, evaluation_row
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
@@ -226,9 +226,7 @@ class FederatedEvalCallback(RoundCallback):
 
     def _rows(self, policy: str, round: int, evaluation: Evaluation) -> list[tuple[Any, ...]]:
         rates = evaluation.success_list or [None] * len(evaluation.returns)
-        success = ["" if rate is None else f"{rate:.6g}" for rate in rates]
-        clients = zip(self.model.client_ids, evaluation.returns, evaluation.lengths, success, strict=True)
         return [
-            (round, self.model.environment_steps, policy, client, f"{r.mean():.6g}", f"{r.std():.6g}", f"{n.mean():.6g}", rate)
-            for client, r, n, rate in clients
+            evaluation_row(round, self.model.environment_steps, policy, *client)
+            for client in zip(self.model.client_ids, evaluation.returns, evaluation.lengths, rates, strict=True)
         ]

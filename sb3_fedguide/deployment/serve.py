@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from fed_envs.files import GrowingTable
 from fed_envs.plain_data import State, freeze, thaw
 from sb3_fedguide.deployment.clients import RUN_FACTS, Clients, difference, server_facts
 from sb3_fedguide.deployment.config import ServerConfig, TooFewClients
 from sb3_fedguide.deployment.transport import RUN, UNPREPARED, Failure, Kind, Message, Transport
 from sb3_fedguide.server.build import make_strategy
-from sb3_fedguide.server.metrics import EvaluationTable, count_tests, evaluation_metrics, merge_metrics, read_evaluations
+from sb3_fedguide.server.metrics import EVALUATION_COLUMNS, count_tests, evaluation_metrics, merge_metrics, read_evaluations
 from sb3_fedguide.server.payload import Payload
 from sb3_fedguide.server.rounds import Coordinator, participants, payload_bytes, rejections
 from sb3_fedguide.server.trunk import TrunkAverages, excessive_updates, moments_fault
@@ -92,7 +93,7 @@ class Server:
         self.finished = False
         #: who has heard that the run is over
         self.dismissed: list[int] = []
-        self._table = EvaluationTable(None if self.folder is None else self.folder / EVALUATIONS)
+        self._table = None if self.folder is None else GrowingTable(self.folder / EVALUATIONS)
 
     def run(self) -> None:
         """See :func:`serve`."""
@@ -254,7 +255,9 @@ class Server:
             for evaluation in read_evaluations(client, reply.facts)
             if 0 < evaluation.round <= round
         ]
-        self._table.add(evaluations, self.timesteps)
+        if self._table is not None and evaluations:
+            self._table.begin(EVALUATION_COLUMNS)
+            self._table.add([evaluation.row(self.timesteps[evaluation.round - 1]) for evaluation in evaluations])
         if self.on_round is not None and figures is not None and (figures := figures | evaluation_metrics(evaluations)):
             self.on_round(round, {**figures, "time/total_timesteps": self.timesteps[-1]})
         self._save()
@@ -358,7 +361,7 @@ class Server:
         time.sleep(self.config.poll)
 
     def _save(self) -> None:
-        if self.folder is None:
+        if self.folder is None or self._table is None:
             return
         state: State = {
             "server": self.clients.facts,
@@ -377,7 +380,7 @@ class Server:
 
         :raises ValueError: for that of another federation
         """
-        if self.folder is None:
+        if self.folder is None or self._table is None:
             return
         remove_leftovers(self.folder / CHECKPOINTS)
         found = newest_checkpoint(self.folder / CHECKPOINTS)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,10 +39,29 @@ class ClientEvaluation:
         return {name: value for name, value in vars(self).items() if name != "client"}
 
     def row(self, timesteps: int) -> tuple[Any, ...]:
-        """Of the table."""
-        rate = "" if self.successes is None else f"{np.mean(self.successes):.6g}"
-        mean, std, length = np.mean(self.returns), np.std(self.returns), np.mean(self.lengths)
-        return (self.round, timesteps, self.policy, self.client, f"{mean:.6g}", f"{std:.6g}", f"{length:.6g}", rate)
+        """Of the table, see :func:`evaluation_row`."""
+        rate = None if self.successes is None else float(np.mean(self.successes))
+        return evaluation_row(self.round, timesteps, self.policy, self.client, self.returns, self.lengths, rate)
+
+
+def evaluation_row(
+    round: int,
+    timesteps: int,
+    policy: str,
+    client: int,
+    returns: Sequence[float] | np.ndarray,
+    lengths: Sequence[int] | np.ndarray,
+    success_rate: float | None,
+) -> tuple[Any, ...]:
+    """A row under :data:`EVALUATION_COLUMNS`.
+
+    :param timesteps: environment steps of all clients together
+    :param returns: of the client's episodes, ``(n_episodes,)``, like ``lengths``
+    :param success_rate: ``None`` where the environment does not say
+    """
+    rate = "" if success_rate is None else f"{success_rate:.6g}"
+    mean, std, length = np.mean(returns), np.std(returns), np.mean(lengths)
+    return (round, timesteps, policy, client, f"{mean:.6g}", f"{std:.6g}", f"{length:.6g}", rate)
 
 
 def read_evaluations(client: int, facts: Mapping[str, Any]) -> list[ClientEvaluation]:
@@ -129,38 +145,3 @@ def evaluation_metrics(evaluations: Iterable[ClientEvaluation]) -> dict[str, flo
     if broadcast := by_policy.get("broadcast"):
         figures["eval/broadcast_mean_reward"] = float(np.mean([np.mean(evaluation.returns) for evaluation in broadcast]))
     return figures
-
-
-class EvaluationTable:
-    """A CSV of evaluations that is as long as the server's checkpoint says when a run goes on."""
-
-    def __init__(self, path: Path | None) -> None:
-        """:param path: ``None`` for no file"""
-        self.path = path
-
-    @property
-    def size(self) -> int:
-        """Bytes that are written."""
-        return self.path.stat().st_size if self.path is not None and self.path.exists() else 0
-
-    def cut(self, size: int) -> None:
-        """Forget what was written after the checkpoint: it will be written again."""
-        if self.path is not None and self.size > size:
-            os.truncate(self.path, size)
-
-    def add(self, evaluations: Iterable[ClientEvaluation], timesteps: Sequence[int]) -> None:
-        """Append rows, on the disk when this returns.
-
-        :param timesteps: of all clients together, after each round
-        """
-        rows = [evaluation.row(timesteps[evaluation.round - 1]) for evaluation in evaluations]
-        if self.path is None or not rows:
-            return
-        is_new = self.size == 0
-        with self.path.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            if is_new:
-                writer.writerow(EVALUATION_COLUMNS)
-            writer.writerows(rows)
-            file.flush()
-            os.fsync(file.fileno())
