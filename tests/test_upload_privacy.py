@@ -6,7 +6,6 @@ import functools
 import importlib.util
 import math
 import secrets
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from sb3_fedguide.common.privacy_accountant import SENSITIVITY, epsilon
 from sb3_fedguide.common.upload_privacy import gaussian_noise
 from sb3_fedguide.deployment.serve import serve
 from sb3_fedguide.deployment.site import Site
+from sb3_fedguide.deployment.transport import RUN, Message
 from sb3_fedguide.registry import algorithm
 from sb3_fedguide.seeding import Role, seed_sequence
 from sb3_fedguide.server.metrics import merge_metrics
@@ -79,12 +79,13 @@ def test_noise_has_the_variance_of_the_formula_and_is_another_for_everybody_and_
 
 
 def test_the_noise_is_gaussian_and_follows_from_key_and_content():
-    noise = np.sort(gaussian_noise(b"key", b"update", 20_001))
-    distance = np.abs(norm.cdf(noise) - (np.arange(len(noise)) + 0.5) / len(noise)).max()
+    noise = gaussian_noise(b"key", b"update", 20_001)
+    ordered = np.sort(noise)
+    distance = np.abs(norm.cdf(ordered) - (np.arange(len(noise)) + 0.5) / len(noise)).max()
     assert distance < 1.95 / math.sqrt(len(noise))  # Kolmogorov and Smirnov, 0.1 %
-    assert (noise == np.sort(gaussian_noise(b"key", b"update", 20_001))).all()
+    assert (noise == gaussian_noise(b"key", b"update", 20_001)).all()
     others = [gaussian_noise(b"kez", b"update", 20_001), gaussian_noise(b"key", b"updatf", 20_001)]
-    assert all(abs(np.corrcoef(np.sort(noise), other)[0, 1]) < 0.03 for other in others)
+    assert all(abs(np.corrcoef(noise, other)[0, 1]) < 0.03 for other in others)
 
 
 def test_the_first_upload_is_compared_with_what_everybody_knows_and_not_with_the_warm_start():
@@ -155,6 +156,15 @@ def test_a_run_that_goes_on_uploads_the_same_and_counts_on():
             make("fedsvrpgm", "Bandit2D", **other).load_state(first.save_state())
     with pytest.raises(ValueError, match=r"its noise_multiplier is None, here it is 0\.05"):
         make("fedsvrpgm", "Bandit2D", **PRIVATE).load_state(trained("fedsvrpgm", 1).save_state())
+    with pytest.raises(ValueError, match=r"its noise_multiplier is 0\.05, here it is None"):
+        make("fedsvrpgm", "Bandit2D", normalize=True).load_state(first.save_state())
+
+
+def test_of_an_update_that_is_no_number_nothing_is_sent():
+    model = make("fedavg", "Bandit2D", **PRIVATE)
+    next(iter(model.known_parameters.values()))[0].flat[0] = np.nan
+    model.round = 1
+    assert np.isnan(flat(model.outgoing(0))).all() and np.isfinite(flat(model.outgoing(1))).all()
 
 
 def test_a_saved_model_goes_on_counting(tmp_path):
@@ -185,7 +195,7 @@ def private_federation(algo: str, folder, fresh: bool = True, **more: Any):
     return config, transport
 
 
-def seeded_keys(monkeypatch) -> Callable[[int], bytes]:
+def seeded_keys(monkeypatch) -> None:
     """Let sites draw, in the order in which they are made, the keys of the federation in one process."""
     waiting = [seed_sequence(3, Role.UPLOAD_NOISE, client).generate_state(8).tobytes() for client in CLIENTS]
 
@@ -193,7 +203,6 @@ def seeded_keys(monkeypatch) -> Callable[[int], bytes]:
         return waiting.pop(0) if waiting else bytes(size)  # those made later take theirs from the disk
 
     monkeypatch.setattr(secrets, "token_bytes", token_bytes)
-    return token_bytes
 
 
 @pytest.mark.parametrize("algo", ["fedguide-r", "fedrl"])
@@ -290,6 +299,7 @@ def test_epsilon_of_published_numbers():
         ("fedavg", {"normalize": "shared"}, "normalize='shared' uploads exact observation statistics; use normalize=True"),
         ("fedavg", {"clipping_norm": None}, "in units of clipping_norm, and there is none: give one"),
         ("fedguide-a", {}, "FedGuideA uploads prior.head as well; use FedAvg"),
+        ("fedguide-a", {"noise_multiplier": 0.0}, "FedGuideA uploads prior.head as well; use FedAvg"),
         ("fedavg", {"noise_multiplier": -1.0}, "noise_multiplier=-1 must be at least 0"),
         ("fedavg", {"noise_multiplier": math.nan}, "noise_multiplier=nan must be finite"),
         ("fedavg", {"clipping_norm": 0.0}, "clipping_norm=0 must be positive"),
@@ -302,18 +312,42 @@ def test_what_noise_does_not_protect_and_what_makes_no_sense_is_refused(algo, mo
         make(algo, "Bandit2D", **{**PRIVATE, **more})
 
 
-def test_an_algorithm_of_ones_own_that_uploads_more_is_refused():
+@pytest.mark.parametrize("noise_multiplier", [0.0, 1.0])
+@pytest.mark.parametrize("name", ["mean_reward", "n_samples_reward"])
+def test_an_algorithm_of_ones_own_that_uploads_more_is_refused(name, noise_multiplier):
     class Talkative(algorithm("fedavg")):  # type: ignore[misc]
-        def upload(self, index):
-            return {**super().upload(index), "mean_reward": np.zeros(1, dtype=np.float32)}
+        begins = 0
 
-    make_own = functools.partial(Talkative, "MlpPolicy", make("fedavg", "Bandit2D").get_env(), rollout_size=32, batch_size=16)
-    with pytest.raises(ValueError, match="Talkative uploads mean_reward as well"):
-        make_own(clipping_norm=1.0, noise_multiplier=1.0)
-    model = make_own(clipping_norm=1.0)
+        def upload(self, index):
+            more = {name: np.zeros(1, dtype=np.float32)} if self.round >= self.begins else {}
+            return {**super().upload(index), **more}
+
+    env, settings = make("fedavg", "Bandit2D").get_env(), {"clipping_norm": 1.0, "noise_multiplier": noise_multiplier}
+    make_own = functools.partial(Talkative, "MlpPolicy", env, rollout_size=32, batch_size=16, **settings)
+    with pytest.raises(ValueError, match=f"Talkative uploads {name} as well"):
+        make_own()
+    Talkative.begins = 1  # so that nobody could know when it was made
+    model = make_own()
     model.round = 1
-    with pytest.raises(ValueError, match="do not protect mean_reward"):
+    with pytest.raises(ValueError, match=f"do not protect {name}"):
         model.outgoing(0)
+
+
+@pytest.mark.parametrize("kind", ["moments", "trunk"])
+def test_a_site_that_trains_no_prior_gives_nothing_of_its_data_before_the_first_round(kind, tmp_path):
+    site = Site(make("fedavg", "Bandit2D", [0], **PRIVATE), N_ROUNDS, tmp_path / "site", report=False)
+    with pytest.raises(ValueError, match=f"FedAvg shares nothing before the first round, and the server asks for {kind}"):
+        site.handle(Message(kind, 0, facts={RUN: "1"}))
+
+
+def test_a_site_that_reports_nothing_keeps_the_norm_of_its_updates(tmp_path):
+    config, transport = federation("fedavg", "Bandit2D", tmp_path, clipping_norm=0.01)
+    transport.make = lambda client: Site(
+        make("fedavg", "Bandit2D", [client], clipping_norm=0.01), N_ROUNDS, tmp_path / f"site_{client}", report=False
+    )
+    logs: list[dict[str, float]] = []
+    serve(config, transport, None, lambda round, metrics: logs.append(dict(metrics)))
+    assert logs and not any(key.startswith("privacy/") and key != "privacy/noise_multiplier" for log in logs for key in log)
 
 
 def test_the_command_line_says_what_is_missing_and_what_was_spent(tmp_path, monkeypatch, capfd):

@@ -100,13 +100,11 @@ class ParameterAveraging(Federation):
 
     def _setup_model(self) -> None:
         super()._setup_model()  # type: ignore[safe-super]  # the learner's
-        self._privacy.check()
-        if self._privacy.is_on:
-            self._privacy.begin()
+        self._privacy.begin()
 
     def _identity(self) -> dict[str, Any]:
-        privacy = {"noise_multiplier": self.noise_multiplier, "clipping_norm": self.clipping_norm}
-        return {**super()._identity(), **(privacy if self._privacy.is_on else {})}  # what was spent is counted in these
+        privacy = {"noise_multiplier": self.noise_multiplier or None, "clipping_norm": self.clipping_norm}
+        return {**super()._identity(), **privacy}  # what was spent is counted in these
 
     def public_parameters(self) -> Parameters:
         """What everybody knows of what each client uploads, before anything was exchanged: the policies that come of the
@@ -135,7 +133,7 @@ class ParameterAveraging(Federation):
         return self._privacy.has_noise
 
     def upload_metrics(self, public: bool = False) -> dict[str, float]:
-        return self._privacy.figures(public) if self._privacy.is_on else {}
+        return self._privacy.metrics(public) if self._privacy.is_on else {}
 
     def upload_summary(self) -> dict[str, Any]:
         return self._privacy.summary() if self._privacy.is_on else {}

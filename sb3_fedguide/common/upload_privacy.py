@@ -47,12 +47,43 @@ class UploadPrivacy:
     def has_noise(self) -> bool:
         return self.model.noise_multiplier > 0
 
-    def check(self) -> None:
-        """:raises ValueError: for noise without a norm that it is measured by or without the accountant, and where something
-        would leave the client that it does not protect"""
+    def begin(self) -> None:
+        """Check that clipping and noise reach all that is uploaded, and lay out ``privacy_state``, unless it was loaded.
+
+        It holds for each client, ``(n_clients,)``: uploads so far that were clipped or got noise (``uploads``), and of them
+        those that were longer than ``clipping_norm`` (``clipped``); the round of the last one (``round``), and the norm of its
+        update (``norm``); and the noise's ``key``, ``(n_clients, 8)``, uint32.
+
+        :raises ValueError: for noise without a norm that it is measured by or without the accountant, and where something
+            would leave the client that is not protected
+        """
         model = self.model
-        if not self.has_noise:
+        if self.has_noise:
+            self._check_noise()
+        if not self.is_on:
             return
+        public = model.public_parameters()
+        if other := sorted(model.upload_shapes().keys() - public.keys() - {N_SAMPLES}):
+            raise ValueError(
+                f"clipping_norm and noise_multiplier protect uploads of parameters, and {type(model).__name__} uploads "
+                f"{', '.join(other)} as well; use FedAvg, FedProx, FedKL, FedSVRPGM, FedRL or FedGuideR"
+            )
+        if model.privacy_state:
+            return
+        assert model.seed is not None
+        n_clients = model.n_clients
+        keys = [seed_sequence(model.seed, Role.UPLOAD_NOISE, client).generate_state(8) for client in model.client_ids]
+        model.privacy_state.update(
+            uploads=np.zeros(n_clients, dtype=int),
+            clipped=np.zeros(n_clients, dtype=int),
+            round=np.full(n_clients, -1),
+            norm=np.zeros(n_clients),
+            key=np.array(keys, dtype=np.uint32).reshape(n_clients, 8),
+        )
+        model.known_parameters = public
+
+    def _check_noise(self) -> None:
+        model = self.model
         if not self.is_on:
             raise ValueError(
                 f"noise_multiplier={model.noise_multiplier} is in units of clipping_norm, and there is none: give one, "
@@ -64,36 +95,14 @@ class UploadPrivacy:
                 "noise_multiplier protects uploads of parameters, and normalize='shared' uploads exact observation "
                 "statistics; use normalize=True, whose statistics stay with their client, or False"
             )
-        if other := sorted(model.upload_shapes().keys() - model.public_parameters().keys() - {N_SAMPLES}):
-            raise ValueError(
-                f"noise_multiplier protects uploads of parameters, and {type(model).__name__} uploads {', '.join(other)} as "
-                "well; use FedAvg, FedProx, FedKL, FedSVRPGM, FedRL or FedGuideR"
-            )
-
-    def begin(self) -> dict[str, np.ndarray]:
-        """Per client, ``(n_clients,)``: uploads so far that were clipped or got noise, and of them those that were longer than
-        ``clipping_norm``; the round of the last one, and the norm of its update; and the key, ``(n_clients, 8)``."""
-        model, state = self.model, self.model.privacy_state
-        if not state:
-            n_clients = model.n_clients
-            state["uploads"] = np.zeros(n_clients, dtype=int)
-            state["clipped"] = np.zeros(n_clients, dtype=int)
-            state["round"] = np.full(n_clients, -1)
-            state["norm"] = np.zeros(n_clients)
-            assert model.seed is not None
-            keys = [seed_sequence(model.seed, Role.UPLOAD_NOISE, client).generate_state(8) for client in model.client_ids]
-            state["key"] = np.array(keys, dtype=np.uint32).reshape(n_clients, 8)
-            model.known_parameters = model.public_parameters()
-        return state
 
     def draw_secret_keys(self) -> None:
         """Forget the keys that whoever knows the federation's seed knows."""
-        keys = self.begin()["key"]
+        keys = self.model.privacy_state["key"]
         keys[:] = np.frombuffer(secrets.token_bytes(keys.nbytes), dtype=np.uint32).reshape(keys.shape)
 
     def receive(self, broadcasts: Mapping[int, Payload]) -> None:
         """Note what the server knows, by the client's position."""
-        self.begin()
         known = self.model.known_parameters
         for index, broadcast in broadcasts.items():
             for name in broadcast.keys() & known.keys():
@@ -109,8 +118,9 @@ class UploadPrivacy:
             return {}
         if N_SAMPLES not in payload or (not payload[N_SAMPLES] and not self.has_noise):
             return payload
-        apart = (N_SAMPLES,) if self.has_noise else (N_SAMPLES, OBSERVATIONS)
-        values = {name: array for name, array in payload.items() if not name.startswith(apart)}
+        # without noise, shared observation statistics go beside the parameters; with it there are none
+        apart = {name for name in payload if name == N_SAMPLES or (name.startswith(OBSERVATIONS) and not self.has_noise)}
+        values = {name: array for name, array in payload.items() if name not in apart}
         known = {name: array[index] for name, array in model.known_parameters.items()}
         if unprotected := sorted(values.keys() - known.keys()):
             raise ValueError(f"noise_multiplier and clipping_norm do not protect {', '.join(unprotected)}, which it uploads")
@@ -119,11 +129,12 @@ class UploadPrivacy:
             if model.mix_now() == 0:  # as for everybody
                 return {N_SAMPLES: n_samples}
             values, n_samples = known, np.array(model.rollout_size, dtype=np.float32)
-        return {**payload, **self._privatized(index, values, known), N_SAMPLES: n_samples}
+        others = {name: payload[name] for name in apart}
+        return {**others, **self._privatized(index, values, known), N_SAMPLES: n_samples}
 
     def _privatized(self, index: int, values: Payload, known: Payload) -> Payload:
         """The arrays ``values`` with their difference to ``known`` clipped and with noise."""
-        model, state = self.model, self.begin()
+        model, state = self.model, self.model.privacy_state
         assert model.clipping_norm is not None
         names = sorted(values)
         ours, theirs = (
@@ -143,27 +154,27 @@ class UploadPrivacy:
         parts = zip(names, np.split(vector, ends[:-1]), strict=True)
         return {name: part.astype(np.float32).reshape(np.shape(values[name])) for name, part in parts}
 
-    def figures(self, public: bool) -> dict[str, float]:
+    def metrics(self, public: bool) -> dict[str, float]:
         """This round's uploads, by log key; nothing where there were none.
 
         :param public: only what tells nothing of the updates
         """
-        model, state = self.model, self.begin()
+        model, state = self.model, self.model.privacy_state
         norms = state["norm"][state["round"] == model.round]
         if not len(norms):
             return {}
         assert model.clipping_norm is not None
-        figures = {"privacy/noise_multiplier": float(model.noise_multiplier)}
+        metrics = {"privacy/noise_multiplier": float(model.noise_multiplier)}
         if self.has_noise:
-            figures[EPSILON] = epsilon(model.noise_multiplier, int(state["uploads"].max()), model.delta)
+            metrics[EPSILON] = epsilon(model.noise_multiplier, int(state["uploads"].max()), model.delta)
         if not public:
-            figures["privacy/update_norm"] = float(np.median(norms))
-            figures["privacy/clipped"] = float(np.mean(norms > model.clipping_norm))
-        return figures
+            metrics["privacy/update_norm"] = float(np.median(norms))
+            metrics["privacy/clipped"] = float(np.mean(norms > model.clipping_norm))
+        return metrics
 
     def summary(self) -> dict[str, Any]:
         """What was spent in the whole run, for its last page; epsilon is that of the client which uploaded most."""
-        model, state = self.model, self.begin()
+        model, state = self.model, self.model.privacy_state
         uploads = state["uploads"]
         summary = {
             "noise_multiplier": model.noise_multiplier,
@@ -177,8 +188,11 @@ class UploadPrivacy:
 
 
 def clipping_factor(norm: float, clipping_norm: float) -> float:
-    """By what an update of L2 norm ``norm`` is multiplied; exactly one where it is not longer than ``clipping_norm``."""
-    return clipping_norm / norm if norm > clipping_norm else 1.0
+    """By what an update of L2 norm ``norm`` is multiplied; exactly one where it is not longer than ``clipping_norm``.
+
+    Of a norm that is no number it is none either, so that nothing of such an update is uploaded.
+    """
+    return 1.0 if norm <= clipping_norm else clipping_norm / norm
 
 
 def gaussian_noise(key: bytes, content: bytes, size: int) -> np.ndarray:

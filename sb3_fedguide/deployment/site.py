@@ -132,6 +132,11 @@ class Site:
             return reply
         if message.kind == "join":
             return self._join(message)
+        if message.kind in ("moments", "trunk") and not self.model.uses_prior:
+            raise ValueError(
+                f"{type(self.model).__name__} shares nothing before the first round, and the server asks for {message.kind} "
+                "of this client's data"
+            )
         if message.kind in ("round", "finish") or (message.kind == "setup" and message.round > 0):
             if not self.prepared:
                 return Message(message.kind, message.round, facts={UNPREPARED: True})
@@ -211,7 +216,7 @@ class Site:
         if self._evaluation is not None and self._evaluation.is_due(message.round):
             evaluations.append(self._evaluated("deployed", message.round))
         payload = model.outgoing(0)
-        figures = model.upload_metrics(public=model.protects_uploads)
+        figures = model.upload_metrics(public=not self._report)
         if self._report:
             figures = {**self._log.metrics, **figures}
         facts: dict[str, Any] = {"figures": figures, "evaluations": evaluations}
