@@ -12,6 +12,8 @@ DIST := $(VENV)/.dist-installed
 SITE := $(VENV)/.site-installed
 # Small networks gain nothing from threads, and threads of several libraries get into each other's way.
 export OMP_NUM_THREADS ?= 1
+# Workers of the test suite must find the tests in the same order, in which sets may have a say.
+export PYTHONHASHSEED ?= 0
 # A worker of the test suite takes about a gigabyte; make test WORKERS= runs all tests in one process.
 WORKERS ?= --numprocesses auto --maxprocesses 4 --dist worksteal
 
