@@ -94,6 +94,14 @@ def test_a_part_of_a_study_can_be_chosen(tmp_path):
     assert all(tmp_path / "elsewhere" in run.result.parents for run in elsewhere.runs)
 
 
+def test_hyperparameters_reach_the_runs_as_they_are(tmp_path):
+    params = {"learning_rate": "lin_3e-4", "ent_coef": 1e-05, "prior_loss": "sample", "pretraining": {"dataset": "Größe 🙂/{client}"}}
+    path = write(tmp_path, methods={"fedguide": {"params": params}}, seeds=[0])
+    (config,) = plan_of(path).configs
+    asked = {**params, "pretraining": params["pretraining"]["dataset"]}
+    assert {**{name: config.values[name] for name in params}, "pretraining": config.values["pretraining"]["dataset"]} == asked
+
+
 @pytest.mark.parametrize("figures", [("bars",), pytest.param(FIGURES, marks=pytest.mark.slow)], ids=["bars", "all"])
 def test_what_a_study_ends_with(figures, tmp_path, monkeypatch, capfd):
     """Runs that are there stand in for those that the study does; tables and figures lie beside the results."""
@@ -185,6 +193,10 @@ WRONG = {
     "methods: {local: {families: [HopperHard]}}\nfamilies: [Bandit2D]": "unknown family of method 'local': 'HopperHard'",
     "methods: {local: {params: {n_epoch: 1}}}\nfamilies: [Bandit2D]": "method 'local': unknown hyperparameter 'n_epoch'",
     "methods: {local: {conf: papr}}\nfamilies: [Bandit2D]": "Did you mean 'paper'?",
+    "methods: {'': }\nfamilies: [Bandit2D]": "a method has the name ''; give",
+    "methods: {local: , '  ': {algo: fedavg}}\nfamilies: [Bandit2D]": "a method has the name '  '; give",
+    "methods: {local: {params: {learning_rate: 2020-01-01}}}\nfamilies: [Bandit2D]": "'local': params.learning_rate must be made of",
+    "methods: {local: }\nfamilies: [Bandit2D]\nparams: {policy_kwargs: {net_arch: !!set {8}}}": "params.policy_kwargs.net_arch must",
     "methods: {local: {delays: asink}}\nfamilies: [Bandit2D]": "--delays asink",
     "methods: {local: , mine: {algo: local}}\nfamilies: [Bandit2D]": "'local' and 'mine' are both local with the label",
     "methods: {local: , local: }": "the key 'local' stands twice",

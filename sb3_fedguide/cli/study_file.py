@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -172,6 +171,8 @@ def _study(path: Path, content: Any) -> Study:
 def _row(path: Path, file: StudyFile, name: str, entry: Mapping[str, Any]) -> Row:
     own = check_model(f"method {name!r}", MethodEntry, entry, {})
     assert isinstance(own, MethodEntry)
+    if not name.strip():
+        raise ValueError(f"a method has the name {name!r}; give its row of the tables one, such as local")
     if "|" in name or "\n" in name:
         raise ValueError(f"method {name!r} is to be a row of a table; give it a name without | and line breaks")
     if own.algo is None and (first := name.split()[0]) in ALGORITHMS and first != name:
@@ -183,7 +184,7 @@ def _row(path: Path, file: StudyFile, name: str, entry: Mapping[str, Any]) -> Ro
     label = own.label or file.label or Path(conf).stem
     flags = ["-conf", conf, "--label", label]
     params = {**dict(_dotted(file.params)), **dict(_dotted(own.params))}
-    flags += ["-params", *(f"{key}:{_scalar(value)}" for key, value in params.items())] if params else []
+    flags += ["-params", *(_flag_value(name, key, value) for key, value in params.items())] if params else []
     given = {"rounds": file.rounds, "delays": own.delays or file.delays}
     for flag, value in given.items():
         flags += [] if value is None else [f"--{flag}", str(value)]
@@ -205,7 +206,14 @@ def _dotted(params: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
-def _scalar(value: Any) -> str:
-    """As YAML that is read as the same value again."""
-    plain = isinstance(value, str) and re.fullmatch(r"[a-z]+_[\d.]+", value)
-    return value if plain else json.dumps(value)
+def _flag_value(method: str, key: str, value: Any) -> str:
+    """A hyperparameter for ``-params``, as YAML that is read as the same value again.
+
+    :raises ValueError: for a date and whatever else YAML has and no hyperparameter can be
+    """
+    try:
+        return f"{key}:{json.dumps(value, ensure_ascii=False)}"
+    except TypeError:
+        raise ValueError(
+            f"method {method!r}: params.{key} must be made of numbers, texts, lists and mappings, but it is {value}"
+        ) from None
