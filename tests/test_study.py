@@ -186,6 +186,9 @@ WRONG = {
     "methods: {local: }\nfamilies: [Bandit3D]": "unknown environment 'Bandit3D'. Did you mean 'Bandit2D'?",
     "methods: {local: }": "families is missing",
     "methods: {local: }\nfamilies: [Bandit2D]\nseeds: [0, -1]": "the study.seeds",
+    "methods: {local: }\nfamilies: [Bandit2D]\nseeds: []": "the study.seeds: list should have at least 1 item",
+    "methods: {local: {seeds: []}}\nfamilies: [Bandit2D]": "method 'local'.seeds: list should have at least 1 item",
+    "methods: {local: {families: []}}\nfamilies: [Bandit2D]": "method 'local'.families: list should have at least 1 item",
     "methods: {local: {seeds: [1, 1]}}\nfamilies: [Bandit2D]": "seeds of method 'local' names 1 twice",
     "methods: {local: }\nfamilies: [Bandit2D]\nrounds: 0": "the study.rounds",
     "methods: {local: }\nfamilies: [Bandit2D]\nbaseline: locl": "Did you mean 'local'?",
@@ -219,7 +222,10 @@ FLAGS = {
     "--label x": "--label is said in the file of a study",
     "--envs HopperHard": "unknown family of the study: 'HopperHard'",
     "--algos fedkl": "unknown method of the study: 'fedkl'",
-    "--seeds 7": "--seeds leaves no run of the study",
+    "--seeds 7": "no run of the study is left by --seeds; give",
+    "--algos fedavg --seeds 1": "no run of the study is left by --algos with --seeds; give",
+    "--algos local --envs Reacher": "no run of the study is left by --algos with --envs; give",
+    "--algos local --envs Reacher --table-only": "no run of the study is left by --algos with --envs; give",
     "--table-only": "has no results of Bandit2D",
     "--table-only --dry-run": "contradict each other",
 }
@@ -227,7 +233,8 @@ FLAGS = {
 
 @pytest.mark.parametrize("line", FLAGS)
 def test_flags_that_contradict_a_study_are_refused(line, tmp_path, capfd):
-    path = write(tmp_path)
+    methods = {"local": {"families": ["Bandit2D"]}, "fedavg": {"seeds": [0]}}
+    path = write(tmp_path, methods=methods, families=["Bandit2D", "Reacher"])
     try:
         code = main(["--study", path, *line.split()])
     except SystemExit as exit:

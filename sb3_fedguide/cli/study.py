@@ -58,6 +58,9 @@ def _plan(study: Study, arguments: argparse.Namespace, prog: str) -> Plan:
     names = [name for name in families if name in (arguments.envs or families)]
     check_names(arguments.envs, families, "family of the study:")
     _check_places(rows, names)
+    if not any(row.seeds and (row.families is None or set(row.families) & set(names)) for row in rows):
+        given = [flag for flag in ("--algos", "--envs", "--seeds") if getattr(arguments, flag.removeprefix("--"))]
+        raise ValueError(f"no run of the study is left by {' with '.join(given)}; give less of that")
     study = replace(study, rows=rows)
     chosen = {name: families[name] for name in names}
     in_tables = [row.in_tables for row in rows]
@@ -101,7 +104,7 @@ def _part(row: Row, families: Mapping[str, Family], arguments: argparse.Namespac
 
 
 def _check_places(rows: Sequence[Row], families: Sequence[str]) -> None:
-    """:raises ValueError: for two rows whose results would be the same files, and where no run is left"""
+    """:raises ValueError: for two rows whose results would be the same files"""
     taken: dict[tuple[str, str, str], Row] = {}
     for row in rows:
         for family in row.families or families:
@@ -111,8 +114,6 @@ def _check_places(rows: Sequence[Row], families: Sequence[str]) -> None:
                     f"methods {other.name!r} and {row.name!r} are both {row.algo} with the label {row.label!r}, so that their "
                     "results would be the same files; give one of them a label of its own"
                 )
-    if not any(row.seeds for row in rows):
-        raise ValueError("--seeds leaves no run of the study")
 
 
 def _plan_row(row: Row, sources: Sequence[tuple[str, str]], arguments: argparse.Namespace, prog: str) -> Plan:

@@ -20,6 +20,7 @@ from sb3_fedguide.settings.schema import check_model
 
 Count = Annotated[int, pydantic.Field(ge=1, lt=2**31)]
 Seed = Annotated[int, pydantic.Field(ge=0, lt=2**31)]
+AtLeastOne = pydantic.Field(min_length=1)
 
 
 class MethodEntry(pydantic.BaseModel):
@@ -39,8 +40,8 @@ class MethodEntry(pydantic.BaseModel):
     conf: str | None = None
     label: str | None = None
     params: dict[str, Any] = {}
-    seeds: list[Seed] | None = None
-    families: list[str] | None = None
+    seeds: Annotated[list[Seed], AtLeastOne] | None = None
+    families: Annotated[list[str], AtLeastOne] | None = None
     delays: str | None = None
 
 
@@ -66,7 +67,7 @@ class StudyFile(pydantic.BaseModel):
     methods: dict[str, dict[str, Any] | None] = {}
     families: list[str] = []
     metadata: list[str] = []
-    seeds: list[Seed] = list(SEEDS)
+    seeds: Annotated[list[Seed], AtLeastOne] = list(SEEDS)
     rounds: Count | None = None
     conf: str = "tuned"
     label: str | None = None
