@@ -61,7 +61,8 @@ def create_run_folder(log_folder: Path, algo: str, family: str) -> Path:
 def events_folder(folder: Path, tensorboard_log: str | None, family: str, algo: str) -> Path:
     """Where the TensorBoard events of the run in ``folder`` are.
 
-    TensorBoard calls a run by the folder of its events, so they lie in the run's own; those of an earlier version in its ``tb``.
+    TensorBoard calls a run by the folder of its events, so they lie in the run's own. Those of an earlier version lie in its
+    ``tb``, and go on there.
 
     :param tensorboard_log: the folder that ``--tensorboard-log`` has named
     """

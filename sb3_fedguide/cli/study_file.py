@@ -11,14 +11,14 @@ from typing import Annotated, Any
 
 import pydantic
 
-from sb3_fedguide.cli.benchmark_arguments import FOLDER, check_once
+from sb3_fedguide.cli.benchmark_arguments import AT_ROUNDS, BASELINE, FOLDER, check_once
 from sb3_fedguide.cli.benchmark_results import SEEDS, TableRow
 from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.settings.config import CONFIGURATIONS, NESTED, read_yaml
 from sb3_fedguide.settings.names import check_names
+from sb3_fedguide.settings.pretraining import Count
 from sb3_fedguide.settings.schema import check_model
 
-Count = Annotated[int, pydantic.Field(ge=1, lt=2**31)]
 Seed = Annotated[int, pydantic.Field(ge=0, lt=2**31)]
 AtLeastOne = pydantic.Field(min_length=1)
 
@@ -76,8 +76,8 @@ class StudyFile(pydantic.BaseModel):
     eval_freq: Count | None = None
     eval_episodes: Count | None = None
     eval_average: bool = False
-    baseline: str = "local"
-    at_rounds: list[Count] = [25, 50]
+    baseline: str = BASELINE
+    at_rounds: list[Count] = list(AT_ROUNDS)
     overview: list[str] = ["F"]
     folder: str | None = None
     processes: Count | None = None
@@ -150,7 +150,7 @@ def _study(path: Path, content: Any) -> Study:
     if not file.families and not file.metadata:
         raise ValueError("families is missing: give names such as [HopperHard], or metadata files")
     rows = [_row(path, file, name, entry or {}) for name, entry in file.methods.items()]
-    check_names([file.baseline], [row.name for row in rows] + ["local"], "row as baseline:")
+    check_names([file.baseline], [row.name for row in rows] + [BASELINE], "row as baseline:")
     check_names(file.overview, columns_of(), "column in overview:")
     return Study(
         name=path.stem,
