@@ -73,7 +73,8 @@ def studies() -> str:
 def _table(*flags: str) -> str:
     arguments = parse_benchmark([*flags, "--table-only"], "compare.py")
     plan = prepare_benchmark(arguments, "compare.py")
-    tables = markdown(make_tables(arguments, plan.families, plan.rows))
+    assert plan.results is not None
+    tables = markdown(make_tables(arguments, plan.families, plan.results))
     return "\n".join(line for line in tables.splitlines() if line.startswith("|"))
 
 

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 import fed_envs
+from sb3_fedguide.benchmark import results
 from sb3_fedguide.benchmark.costs import estimate
 from sb3_fedguide.benchmark.figures import layout
 from sb3_fedguide.benchmark.figures.styles import style
@@ -96,16 +97,11 @@ def test_a_part_of_a_study_can_be_chosen(tmp_path):
 
 
 def test_hyperparameters_reach_the_runs_as_they_are(tmp_path):
-    params = {
-        "learning_rate": "lin_3e-4",
-        "ent_coef": 1e-05,
-        "prior_loss": "sample",
-        "pretraining": {"dataset": "Größe 🙂/{client}"},
-    }
-    path = write(tmp_path, methods={"fedguide": {"params": params}}, seeds=[0])
-    (config,) = plan_of(path).configs
-    asked = {**params, "pretraining": params["pretraining"]["dataset"]}
-    assert {**{name: config.values[name] for name in params}, "pretraining": config.values["pretraining"]["dataset"]} == asked
+    params = {"learning_rate": "lin_3e-4", "ent_coef": 1e-05, "prior_loss": "sample"}
+    nested = {"pretraining": {"dataset": "Größe 🙂/{client}"}}
+    (config,) = plan_of(write(tmp_path, methods={"fedguide": {"params": {**params, **nested}}}, seeds=[0])).configs
+    assert {name: config.values[name] for name in params} == params
+    assert config.values["pretraining"]["dataset"] == nested["pretraining"]["dataset"]
 
 
 @pytest.mark.parametrize("figures", [("bars",), pytest.param(FIGURES, marks=pytest.mark.slow)], ids=["bars", "all"])
@@ -145,6 +141,21 @@ def test_what_a_study_ends_with(figures, tmp_path, monkeypatch, capfd):
              "aggregate": "aggregate.png", "speedup": "speedup.png"}  # fmt: skip
     for figure in figures:
         assert figure not in drawn or (folder / drawn[figure]).stat().st_size > 1000
+
+
+@pytest.mark.parametrize("flags", [[], ["--table-only"]], ids=["all there", "table only"])
+def test_results_are_read_once_for_tables_and_figures(flags, tmp_path, monkeypatch):
+    monkeypatch.setattr(plot, "FIGURES", ("bars",))
+    monkeypatch.setattr(layout, "DPI", 20)
+    monkeypatch.setattr(layout, "FORMATS", ("png",))
+    for seed in (0, 1):
+        done(tmp_path / "results", "local", seed, 1.0)
+    read = []
+    monkeypatch.setattr(results, "read_result", lambda path: read.append(path.name) or read_result(path))
+    assert main(["--study", write(tmp_path, methods={"local": None}, eval_average=True), *flags]) == 0
+    before = 0 if flags else 2  # each is held against the settings that are asked for
+    assert len(read) == before + 2
+    assert (tmp_path / "results" / "studies" / "mine" / "bars.png").is_file()
 
 
 def test_a_dry_run_lists_and_writes_nothing(tmp_path, capfd):
@@ -237,8 +248,8 @@ WRONG = {
     "methods: {local: {conf: papr}}\nfamilies: [Bandit2D]": "Did you mean 'paper'?",
     "methods: {'': }\nfamilies: [Bandit2D]": "a method has the name ''; give",
     "methods: {local: , '  ': {algo: fedavg}}\nfamilies: [Bandit2D]": "a method has the name '  '; give",
-    "methods: {local: {params: {learning_rate: 2020-01-01}}}\nfamilies: [Bandit2D]": "'local': params.learning_rate must be made of",
-    "methods: {local: }\nfamilies: [Bandit2D]\nparams: {policy_kwargs: {net_arch: !!set {8}}}": "params.policy_kwargs.net_arch must",
+    "methods: {local: {params: {learning_rate: 2020-01-01}}}\nfamilies: [Bandit2D]": "'local': params.learning_rate must",
+    "methods: {local: }\nfamilies: [Bandit2D]\nparams: {policy_kwargs: {net_arch: !!set {8}}}": "kwargs.net_arch must",
     "methods: {local: {delays: asink}}\nfamilies: [Bandit2D]": "--delays asink",
     "methods: {local: , mine: {algo: local}}\nfamilies: [Bandit2D]": "'local' and 'mine' are both local with the label",
     "methods: {local: , local: }": "the key 'local' stands twice",
