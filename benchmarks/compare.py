@@ -15,10 +15,10 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from sb3_fedguide.cli.benchmark import Plan, prepare_benchmark
+from sb3_fedguide.cli.benchmark import prepare_benchmark
 from sb3_fedguide.cli.benchmark_arguments import parse_benchmark
 from sb3_fedguide.cli.benchmark_costs import total_hours
-from sb3_fedguide.cli.benchmark_results import make_tables
+from sb3_fedguide.cli.benchmark_results import make_tables, results_of_rows
 from sb3_fedguide.cli.benchmark_tables import markdown
 from sb3_fedguide.cli.study_file import read_study
 
@@ -61,21 +61,20 @@ def studies() -> str:
     for path in sorted(STUDIES.glob("*.yml")):
         study = read_study(path)
         with tempfile.TemporaryDirectory() as nothing:
-            whole = _plan(path, "-f", nothing)
-        done = len(_plan(path).done)
-        lines.append(f"| `{path.stem}` | {study.title} | {len(whole.runs)}, {done} | {total_hours(whole):.0f} |")
+            arguments = parse_benchmark(["--study", str(path), "--dry-run", "-f", nothing], "compare.py")
+            plan = prepare_benchmark(arguments, "compare.py")  # which puts into arguments what the file says
+        found = results_of_rows(study.folder, plan.families, plan.rows)
+        done = sum(len(results) for rows in found.values() for results in rows.values())
+        hours = total_hours(plan, arguments.eval_freq, arguments.eval_episodes)
+        lines.append(f"| `{path.stem}` | {study.title} | {len(plan.runs)}, {done} | {hours:.0f} |")
     return "\n".join(lines)
-
-
-def _plan(path: Path, *flags: str) -> Plan:
-    arguments = parse_benchmark(["--study", str(path), "--dry-run", *flags], "compare.py")
-    return prepare_benchmark(arguments, "compare.py")
 
 
 def _table(*flags: str) -> str:
     arguments = parse_benchmark([*flags, "--table-only"], "compare.py")
     plan = prepare_benchmark(arguments, "compare.py")
-    tables = markdown(make_tables(arguments, plan.families, plan.rows))
+    assert plan.results is not None
+    tables = markdown(make_tables(arguments, plan.families, plan.results))
     return "\n".join(line for line in tables.splitlines() if line.startswith("|"))
 
 

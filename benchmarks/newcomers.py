@@ -28,11 +28,12 @@ from sb3_fedguide.settings.config import resolve
 class Curve(FederatedEvalCallback):
     """Each client's return at every evaluation, before the first round as well."""
 
-    LAST_ROUNDS = 0
-
     def __init__(self, n_rounds: int) -> None:
         super().__init__(n_rounds, eval_freq=2, n_episodes=5)
         self.points: list[tuple[int, list[float]]] = []
+
+    def is_due(self, round: int) -> bool:
+        return round % self.eval_freq == 0
 
     def _on_training_start(self) -> None:
         super()._on_training_start()

@@ -191,3 +191,10 @@ def test_the_committed_results_give_the_documented_tables(monkeypatch):
     for folder in sorted((ROOT / "benchmarks" / "results").glob("*-*/")):
         for path in folder.glob("*-seed*.json"):
             assert read_result(path).method in path.name
+
+
+def test_the_committed_studies_and_results_give_the_documented_list(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    compare = importlib.import_module("compare")
+    text = compare.LIST.read_text(encoding="utf-8")
+    assert compare.with_studies(text) == text

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 import fed_envs
+from sb3_fedguide.benchmark import results
 from sb3_fedguide.benchmark.costs import estimate
 from sb3_fedguide.benchmark.figures import layout
 from sb3_fedguide.benchmark.figures.styles import style
@@ -23,6 +24,7 @@ from sb3_fedguide.cli.benchmark_tables import Tables, latex, rows_of
 from sb3_fedguide.cli.delays import read_delays
 from sb3_fedguide.cli.plot import FIGURES
 from sb3_fedguide.cli.study_file import read_study
+from sb3_fedguide.settings import evaluation
 from sb3_fedguide.settings.config import resolve
 from tests.result_files import result, two_families
 
@@ -94,6 +96,14 @@ def test_a_part_of_a_study_can_be_chosen(tmp_path):
     assert all(tmp_path / "elsewhere" in run.result.parents for run in elsewhere.runs)
 
 
+def test_hyperparameters_reach_the_runs_as_they_are(tmp_path):
+    params = {"learning_rate": "lin_3e-4", "ent_coef": 1e-05, "prior_loss": "sample"}
+    nested = {"pretraining": {"dataset": "Größe 🙂/{client}"}}
+    (config,) = plan_of(write(tmp_path, methods={"fedguide": {"params": {**params, **nested}}}, seeds=[0])).configs
+    assert {name: config.values[name] for name in params} == params
+    assert config.values["pretraining"]["dataset"] == nested["pretraining"]["dataset"]
+
+
 @pytest.mark.parametrize("figures", [("bars",), pytest.param(FIGURES, marks=pytest.mark.slow)], ids=["bars", "all"])
 def test_what_a_study_ends_with(figures, tmp_path, monkeypatch, capfd):
     """Runs that are there stand in for those that the study does; tables and figures lie beside the results."""
@@ -133,6 +143,21 @@ def test_what_a_study_ends_with(figures, tmp_path, monkeypatch, capfd):
         assert figure not in drawn or (folder / drawn[figure]).stat().st_size > 1000
 
 
+@pytest.mark.parametrize("flags", [[], ["--table-only"]], ids=["all there", "table only"])
+def test_results_are_read_once_for_tables_and_figures(flags, tmp_path, monkeypatch):
+    monkeypatch.setattr(plot, "FIGURES", ("bars",))
+    monkeypatch.setattr(layout, "DPI", 20)
+    monkeypatch.setattr(layout, "FORMATS", ("png",))
+    for seed in (0, 1):
+        done(tmp_path / "results", "local", seed, 1.0)
+    read = []
+    monkeypatch.setattr(results, "read_result", lambda path: read.append(path.name) or read_result(path))
+    assert main(["--study", write(tmp_path, methods={"local": None}, eval_average=True), *flags]) == 0
+    before = 0 if flags else 2  # each is held against the settings that are asked for
+    assert len(read) == before + 2
+    assert (tmp_path / "results" / "studies" / "mine" / "bars.png").is_file()
+
+
 def test_a_dry_run_lists_and_writes_nothing(tmp_path, capfd):
     path = write(tmp_path)
     before = sorted(tmp_path.rglob("*"))
@@ -146,27 +171,60 @@ def test_a_dry_run_lists_and_writes_nothing(tmp_path, capfd):
 
 def test_the_offline_stage_counts_once_for_a_seed_and_setting(tmp_path):
     plan = plan_of(write(tmp_path, methods={"local": None, "fedavg": None, "fedguide": None, "fedguide-p": None}))
-    costs = costs_of(plan)
+    costs = costs_of(plan, 5, 3)
     cloning = [key for _, key in offline_seconds(plan, costs) if json.loads(key)[0] == "bc"]
     value = [key for _, key in offline_seconds(plan, costs) if json.loads(key)[0] == "dice"]
     assert len(cloning) == 2 and len(value) == 2  # a seed each, whatever the number of methods
     once = sum(offline_seconds(plan, costs).values())
-    assert total_hours(plan) == pytest.approx((once + sum(cost.rounds + cost.evaluation for cost in costs)) / 3600)
+    assert total_hours(plan, 5, 3) == pytest.approx((once + sum(cost.rounds + cost.evaluation for cost in costs)) / 3600)
     assert cost_rows(plan, costs)[-1]["missing"] == "8"
 
 
 def test_an_estimate_is_near_what_was_measured():
     """HopperHard with four environments per client: 2.65 s a round on a quiet core (docs/performance.md), 254 s offline."""
     family = fed_envs.load_family("HopperHard")
-    cost = {
-        algo: estimate(algo, resolve(algo, family).values, family.backbone, 8, 0) for algo in ("local", "fedavg", "fedguide")
-    }
+    cost = {algo: estimate(algo, resolve(algo, family).values, family, 0, 5, 10) for algo in ("local", "fedavg", "fedguide")}
     assert cost["local"].rounds / 100 == pytest.approx(2.65, rel=0.05)
     assert cost["fedavg"].rounds > 1.15 * cost["local"].rounds  # eight epochs, not four
     assert sum(cost["fedguide"].offline.values()) == pytest.approx(254, rel=0.05)
     assert set(cost["local"].offline) < set(cost["fedguide"].offline)
     paper = resolve("fedguide", family, "paper").values
-    assert sum(estimate("fedguide", paper, family.backbone, 8, 0).offline.values()) > 3600
+    assert sum(estimate("fedguide", paper, family, 0, 5, 10).offline.values()) > 3600
+
+
+@pytest.mark.parametrize(
+    ("algo", "settings", "average", "number"),
+    [
+        ("local", {}, False, 4), ("local", {}, True, 8), ("fedavg", {}, False, 7), ("fedavg", {}, True, 7),
+        ("fedavg", {"average": "critic"}, False, 4), ("fedavg", {"average_until": 10}, False, 5),
+        ("fedguide-a", {"average_every": 20}, False, 5), ("fedguide-a", {"average_every": 20}, True, 8),
+    ],
+)  # fmt: skip
+def test_every_evaluation_is_in_the_estimate(algo, settings, average, number, monkeypatch):
+    """Deployed policies in rounds 10, 20, 24 and 25; what the server sends in 10, 20 and the last."""
+    monkeypatch.setattr(evaluation, "LAST_ROUNDS", 2)
+    family = fed_envs.load_family("Bandit2D")
+    values = resolve(algo, family, overrides={"n_rounds": 25, **settings}).values
+    one = 3 * family.n_clients * 40 / 1e6  # episodes of one step
+    assert estimate(algo, values, family, 0, 10, 3, average).evaluation / one == pytest.approx(number)
+
+
+def test_the_evaluations_that_a_study_asks_for_are_in_its_hours(tmp_path):
+    without, with_averages = [plan_of(write(tmp_path, eval_average=average)) for average in (False, True)]
+    assert total_hours(without, 5, 3) < total_hours(without, 5, 30)
+    assert total_hours(without, 5, 3) < total_hours(with_averages, 5, 3)
+
+
+def test_the_offline_stage_of_a_bandit_has_a_thousand_rows_and_no_trunk():
+    family = fed_envs.load_family("Bandit2D")
+
+    def offline(**settings):
+        overrides = {f"pretraining.{name}": value for name, value in settings.items()}
+        found = estimate("fedguide", resolve("fedguide", family, overrides=overrides).values, family, 0, 5, 10).offline
+        return {json.loads(key)[0]: seconds for key, seconds in found.items()}
+
+    assert offline() == offline(dataset_size=1000) == offline(prior="gaussian") != offline(dataset_size=2000)
+    assert offline(prior="diffusion").keys() - offline().keys() == {"prior"}
 
 
 WRONG = {
@@ -178,6 +236,9 @@ WRONG = {
     "methods: {local: }\nfamilies: [Bandit3D]": "unknown environment 'Bandit3D'. Did you mean 'Bandit2D'?",
     "methods: {local: }": "families is missing",
     "methods: {local: }\nfamilies: [Bandit2D]\nseeds: [0, -1]": "the study.seeds",
+    "methods: {local: }\nfamilies: [Bandit2D]\nseeds: []": "the study.seeds: list should have at least 1 item",
+    "methods: {local: {seeds: []}}\nfamilies: [Bandit2D]": "method 'local'.seeds: list should have at least 1 item",
+    "methods: {local: {families: []}}\nfamilies: [Bandit2D]": "method 'local'.families: list should have at least 1 item",
     "methods: {local: {seeds: [1, 1]}}\nfamilies: [Bandit2D]": "seeds of method 'local' names 1 twice",
     "methods: {local: }\nfamilies: [Bandit2D]\nrounds: 0": "the study.rounds",
     "methods: {local: }\nfamilies: [Bandit2D]\nbaseline: locl": "Did you mean 'local'?",
@@ -185,6 +246,10 @@ WRONG = {
     "methods: {local: {families: [HopperHard]}}\nfamilies: [Bandit2D]": "unknown family of method 'local': 'HopperHard'",
     "methods: {local: {params: {n_epoch: 1}}}\nfamilies: [Bandit2D]": "method 'local': unknown hyperparameter 'n_epoch'",
     "methods: {local: {conf: papr}}\nfamilies: [Bandit2D]": "Did you mean 'paper'?",
+    "methods: {'': }\nfamilies: [Bandit2D]": "a method has the name ''; give",
+    "methods: {local: , '  ': {algo: fedavg}}\nfamilies: [Bandit2D]": "a method has the name '  '; give",
+    "methods: {local: {params: {learning_rate: 2020-01-01}}}\nfamilies: [Bandit2D]": "'local': params.learning_rate must",
+    "methods: {local: }\nfamilies: [Bandit2D]\nparams: {policy_kwargs: {net_arch: !!set {8}}}": "kwargs.net_arch must",
     "methods: {local: {delays: asink}}\nfamilies: [Bandit2D]": "--delays asink",
     "methods: {local: , mine: {algo: local}}\nfamilies: [Bandit2D]": "'local' and 'mine' are both local with the label",
     "methods: {local: , local: }": "the key 'local' stands twice",
@@ -207,7 +272,10 @@ FLAGS = {
     "--label x": "--label is said in the file of a study",
     "--envs HopperHard": "unknown family of the study: 'HopperHard'",
     "--algos fedkl": "unknown method of the study: 'fedkl'",
-    "--seeds 7": "--seeds leaves no run of the study",
+    "--seeds 7": "no run of the study is left by --seeds; give",
+    "--algos fedavg --seeds 1": "no run of the study is left by --algos with --seeds; give",
+    "--algos local --envs Reacher": "no run of the study is left by --algos with --envs; give",
+    "--algos local --envs Reacher --table-only": "no run of the study is left by --algos with --envs; give",
     "--table-only": "has no results of Bandit2D",
     "--table-only --dry-run": "contradict each other",
 }
@@ -215,7 +283,8 @@ FLAGS = {
 
 @pytest.mark.parametrize("line", FLAGS)
 def test_flags_that_contradict_a_study_are_refused(line, tmp_path, capfd):
-    path = write(tmp_path)
+    methods = {"local": {"families": ["Bandit2D"]}, "fedavg": {"seeds": [0]}}
+    path = write(tmp_path, methods=methods, families=["Bandit2D", "Reacher"])
     try:
         code = main(["--study", path, *line.split()])
     except SystemExit as exit:
@@ -248,7 +317,6 @@ def test_committed_studies_can_be_read(path):
     study = read_study(path)
     assert study.title and set(study.families) <= set(fed_envs.FAMILIES)
     assert all(Path(file).is_file() for file in study.metadata)
-    assert f"| `{path.stem}` | {study.title} |" in (path.parents[2] / "docs" / "reproduce.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

@@ -17,9 +17,8 @@ import numpy as np
 
 from sb3_fedguide.benchmark.bootstrap import mean_interval
 from sb3_fedguide.benchmark.paper import PAPER_F
-
-#: CV is taken over so many rounds at the end of a run, all of which are evaluated.
-LAST_ROUNDS = 20
+from sb3_fedguide.settings.evaluation import LAST_ROUNDS
+from sb3_fedguide.settings.pretraining import prior_is_gaussian
 
 #: A client is stuck whose return is below this share of the best that is known of it.
 STUCK = 0.6
@@ -237,7 +236,7 @@ def _offline_bytes(content: Mapping[str, Any]) -> tuple[float | None, float | No
     if "offline_bytes_up" in content:
         return float(content["offline_bytes_up"]), float(content["offline_bytes_down"])
     prior = ((content.get("config") or {}).get("pretraining") or {}).get("prior", "auto")
-    gaussian = prior == "gaussian" or (prior == "auto" and content["env"] == "Bandit2D")
+    gaussian = prior_is_gaussian(prior, "bandit2d" if content["env"] == "Bandit2D" else None)
     return (0.0, 0.0) if gaussian or content["algo"] not in _WITH_PRIOR else (None, None)
 
 

@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 
 from sb3_fedguide.engines import ENGINES
 from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.settings.evaluation import EVAL_EPISODES, EVAL_FREQ
 
 #: Libraries that ``--track`` takes; each is the package of that name and an extra of this one.
 TRACKERS = ("trackio", "wandb")
@@ -70,9 +71,9 @@ def train_parser(prog: str) -> OneLineParser:
     flag("--track-project", metavar="NAME", help=f"project there; by default {TRACK_PROJECT}")
     flag("--cache-dir", metavar="DIR", help="where results of the offline stage are kept; by default $FEDGUIDE_CACHE or "
          "~/.cache/fedguide")  # fmt: skip
-    flag("--eval-freq", type=int, default=5, metavar="ROUNDS", help="rounds between evaluations; the last twenty are all "
-         "evaluated")  # fmt: skip
-    flag("--eval-episodes", type=int, default=10, metavar="N", help="evaluation episodes per client")
+    flag("--eval-freq", type=int, default=EVAL_FREQ, metavar="ROUNDS", help="rounds between evaluations; the last twenty are "
+         "all evaluated")  # fmt: skip
+    flag("--eval-episodes", type=int, default=EVAL_EPISODES, metavar="N", help="evaluation episodes per client")
     flag("--eval-average", action="store_true", help="also evaluate the average of the clients' policies where the method "
          "itself sends no policy")  # fmt: skip
     flag("--no-eval", action="store_true", help="do not evaluate")

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.benchmark_arguments import OF_RUNS, PASSED_ON, SETTINGS, check_methods, parse_benchmark, train_flags
-from sb3_fedguide.cli.benchmark_results import SEEDS, TableRow, asked_rows, make_tables, require_results, write_tables
+from sb3_fedguide.cli.benchmark_results import (
+    SEEDS,
+    TableRow,
+    asked_rows,
+    make_tables,
+    require_results,
+    results_of_rows,
+    write_tables,
+)
 from sb3_fedguide.cli.output import pipe_may_close
 from sb3_fedguide.cli.run import one_message
 from sb3_fedguide.cli.train import (
@@ -28,12 +36,10 @@ from sb3_fedguide.settings.packages import import_packages
 
 if TYPE_CHECKING:
     from fed_envs import Family
+    from sb3_fedguide.cli.benchmark_results import Results
     from sb3_fedguide.cli.benchmark_runs import BenchmarkRun, Outcome
     from sb3_fedguide.cli.study_file import Study
     from sb3_fedguide.settings.config import Config
-
-#: Inside the folder of a family's results: what runs need to go on.
-RUNS = "runs"
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,7 @@ class Plan:
     :param runs: those without a result
     :param configs: the settings of each of them
     :param done: those that have theirs
+    :param results: with ``--table-only``, all that there are
     :param study: that it is of
     """
 
@@ -53,6 +60,7 @@ class Plan:
     runs: Sequence[BenchmarkRun] = ()
     configs: Sequence[Config] = ()
     done: Sequence[BenchmarkRun] = ()
+    results: Results | None = None
     study: Study | None = None
 
 
@@ -79,14 +87,15 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide benchmark") ->
             print_costs(plan, arguments.eval_freq, arguments.eval_episodes)
             return 0
         code = _run(arguments, plan) if plan.runs else 0
-        tables = make_tables(arguments, plan.families, plan.rows, aggregated=code <= EXIT_FAILED)
+        results = plan.results or results_of_rows(arguments.folder, plan.families, plan.rows)
+        tables = make_tables(arguments, plan.families, results, aggregated=code <= EXIT_FAILED)
         if plan.study is not None and len(tables.families) > 1:
             tables = replace(tables, overview=plan.study.overview)
         write_tables(arguments, tables)
         if plan.study is not None and tables.families and code <= EXIT_FAILED:
             from sb3_fedguide.cli.study import write_study
 
-            write_study(plan, arguments, tables)
+            write_study(plan, arguments, results, tables)
     except (ValueError, OSError) as error:
         print(f"{prog}: error: {one_message(error)}", file=sys.stderr)
         return EXIT_FAILED
@@ -124,8 +133,7 @@ def make_plan(arguments: argparse.Namespace, prog: str) -> Plan:
     methods, flags = arguments.algos or list(ALGORITHMS), train_flags(arguments, SETTINGS + PASSED_ON + OF_RUNS)
     sources, families, rows = _sources(arguments), find_families(arguments, prog), asked_rows(arguments)
     if arguments.table_only:
-        require_results(arguments.folder, families, rows)
-        return Plan(families, rows)
+        return Plan(families, rows, results=require_results(arguments.folder, families, rows))
     combinations = []
     for family, source in zip(families.values(), sources, strict=True):
         for method in methods:
@@ -175,10 +183,10 @@ def _benchmark_run(
     arguments: argparse.Namespace, method: str, family: Family, seed: int, flags: Sequence[str]
 ) -> BenchmarkRun:
     from sb3_fedguide.benchmark.results import result_path
-    from sb3_fedguide.cli.benchmark_runs import BenchmarkRun
+    from sb3_fedguide.cli.benchmark_runs import BenchmarkRun, log_folder_of
 
     result = result_path(Path(arguments.folder).absolute(), family.name, arguments.label, method, seed)
-    log_folder = result.parent / RUNS / result.stem
+    log_folder = log_folder_of(result)
     quiet = ("--verbose", "0", *(() if arguments.keep_runs else ("--picture-freq", "0")))
     return BenchmarkRun(
         method=method,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -23,6 +24,10 @@ OF_RUNS = ("delays", "eval_average")
 OF_STUDY = (*SETTINGS, "delays", "metadata", "label", "eval_freq", "eval_episodes", "at_rounds", "baseline")
 ENGINES = ("local", "ray")
 FOLDER = "runs/benchmark"
+#: Method that others are compared with, where nothing else is said.
+BASELINE = "local"
+#: Rounds of the curve that tables show, where nothing else is said.
+AT_ROUNDS = (25, 50)
 #: Of tables in files.
 FORMATS = ("markdown", "latex", "json", "csv")
 
@@ -58,8 +63,8 @@ def benchmark_parser(prog: str) -> OneLineParser:
          "$RAY_ADDRESS, the one that runs here, or a new one")  # fmt: skip
     flag("--table-only", action="store_true", help="do no runs, print what there is")
     flag("--dry-run", action="store_true", help="do nothing; list the runs that are missing and estimate their CPU hours")
-    flag("--at-rounds", nargs="*", type=int, default=[25, 50], metavar="N", help="rounds of the curve that tables show")
-    flag("--baseline", default="local", metavar="ALGO", help="method whose mean return scores 1 where several families are "
+    flag("--at-rounds", nargs="*", type=int, default=list(AT_ROUNDS), metavar="N", help="rounds of the curve that tables show")
+    flag("--baseline", default=BASELINE, metavar="ALGO", help="method whose mean return scores 1 where several families are "
          "aggregated")  # fmt: skip
     for name in FORMATS:
         flag(f"--{name}", nargs="?", const="-", metavar="FILE", help=f"write the tables as {name} to FILE, or to the terminal")
@@ -138,10 +143,16 @@ def check_methods(arguments: argparse.Namespace) -> None:
     check_names([*(arguments.algos or ()), arguments.baseline], ALGORITHMS, "algorithm")
 
 
+@functools.cache
+def _train_actions() -> Sequence[argparse.Action]:
+    """Of the training command, made once for the many runs of a study; nobody changes them."""
+    return tuple(train_parser("")._actions)
+
+
 def train_flags(arguments: argparse.Namespace, names: Sequence[str]) -> list[str]:
     """The flags ``names`` for the training command, with the values that they have here."""
     flags: list[str] = []
-    for action in train_parser("")._actions:
+    for action in _train_actions():
         value = getattr(arguments, action.dest, None) if action.dest in names else None
         if value is True:
             flags.append(action.option_strings[-1])

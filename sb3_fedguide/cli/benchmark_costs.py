@@ -17,12 +17,12 @@ NOTE = (
 )
 
 
-def costs_of(plan: Plan, eval_freq: int = 5, n_episodes: int = 10) -> list[Cost]:
+def costs_of(plan: Plan, eval_freq: int, n_episodes: int) -> list[Cost]:
     """Of each missing run, in the plan's order."""
     found = []
     for run, config in zip(plan.runs, plan.configs, strict=True):
-        family = plan.families[run.family]
-        found.append(estimate(run.method, config.values, family.backbone, family.n_clients, run.seed, eval_freq, n_episodes))
+        family, eval_average = plan.families[run.family], "--eval-average" in run.flags
+        found.append(estimate(run.method, config.values, family, run.seed, eval_freq, n_episodes, eval_average))
     return found
 
 
@@ -33,7 +33,7 @@ def offline_seconds(plan: Plan, costs: list[Cost]) -> dict[tuple[str, str], floa
     }
 
 
-def total_hours(plan: Plan, eval_freq: int = 5, n_episodes: int = 10) -> float:
+def total_hours(plan: Plan, eval_freq: int, n_episodes: int) -> float:
     """CPU hours of all missing runs with their offline stages."""
     costs = costs_of(plan, eval_freq, n_episodes)
     return (sum(cost.rounds + cost.evaluation for cost in costs) + sum(offline_seconds(plan, costs).values())) / 3600

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from sb3_fedguide.benchmark.results import Result
     from sb3_fedguide.cli.benchmark_tables import Tables
 
+    #: Family to the name of a row to its results.
+    Results = dict[str, dict[str, list[Result]]]
+
 SEEDS = (0, 1, 2, 3, 4)
 #: Inside the folder of all results: what the returns of random actions are.
 RANDOM_ACTIONS = "random-actions"
@@ -43,11 +46,16 @@ def asked_rows(arguments: argparse.Namespace) -> list[TableRow]:
     return [TableRow(method, method, arguments.label, seeds) for method in arguments.algos or ALGORITHMS]
 
 
-def require_results(folder: str, families: Iterable[str], rows: Sequence[TableRow]) -> None:
-    """:raises ValueError: for a family without a result"""
-    for name, results in results_of_rows(folder, families, rows).items():
+def require_results(folder: str, families: Iterable[str], rows: Sequence[TableRow]) -> Results:
+    """:func:`results_of_rows`, some of each family.
+
+    :raises ValueError: for a family without a result
+    """
+    found = results_of_rows(folder, families, rows)
+    for name, results in found.items():
         if not results:
             raise ValueError(no_results(folder, name))
+    return found
 
 
 def no_results(folder: str, family: str) -> str:
@@ -57,19 +65,19 @@ def no_results(folder: str, family: str) -> str:
     return f"{folder} has no results of {family} with these methods and seeds{known}"
 
 
-def benchmark_results(arguments: argparse.Namespace, families: Iterable[str]) -> dict[str, dict[str, list[Result]]]:
-    """Family to method to its results."""
+def benchmark_results(arguments: argparse.Namespace, families: Iterable[str]) -> Results:
+    """The results of the methods that the flags ask for."""
     return results_of_rows(arguments.folder, families, asked_rows(arguments))
 
 
-def results_of_rows(folder: str, families: Iterable[str], rows: Sequence[TableRow]) -> dict[str, dict[str, list[Result]]]:
-    """Family to the name of a row to its results, for the rows that have some.
+def results_of_rows(folder: str, families: Iterable[str], rows: Sequence[TableRow]) -> Results:
+    """The results that there are, of the rows that have some.
 
     :raises ValueError: for a damaged file, and for results that cannot stand in one table
     """
     from sb3_fedguide.benchmark.results import check_comparable, read_results
 
-    found: dict[str, dict[str, list[Result]]] = {}
+    found: Results = {}
     for name in families:
         found[name] = {}
         for row in rows:
@@ -81,34 +89,33 @@ def results_of_rows(folder: str, families: Iterable[str], rows: Sequence[TableRo
 
 
 def make_tables(
-    arguments: argparse.Namespace, families: Mapping[str, Family], rows: Sequence[TableRow], aggregated: bool = True
+    arguments: argparse.Namespace, families: Mapping[str, Family], results: Results, aggregated: bool = True
 ) -> Tables:
-    """Tables of all results that there are.
+    """Tables of the results.
 
     :param aggregated: whether several families are aggregated
-    :raises ValueError: for a damaged result file
     """
     from sb3_fedguide.benchmark.results import best_known, measure
     from sb3_fedguide.cli.benchmark_tables import Tables
 
-    found = {name: results for name, results in results_of_rows(arguments.folder, families, rows).items() if results}
+    found = {name: of_family for name, of_family in results.items() if of_family}
     tables = {}
-    for name, results in found.items():
-        baseline = results.get(arguments.baseline)
-        baseline = baseline if len(results) > 1 else None
-        best = best_known(run for runs in results.values() for run in runs)
+    for name, of_family in found.items():
+        baseline = of_family.get(arguments.baseline)
+        baseline = baseline if len(of_family) > 1 else None
+        best = best_known(run for runs in of_family.values() for run in runs)
         tables[f"{name}-{arguments.label}" if arguments.study is None else name] = [
-            replace(measure(runs, arguments.at_rounds, baseline, best), method=row) for row, runs in results.items()
+            replace(measure(runs, arguments.at_rounds, baseline, best), method=row) for row, runs in of_family.items()
         ]
     if len(found) < 2 or not aggregated:
         return Tables(tables, (), ())
-    complete = [method for method in next(iter(found.values())) if all(method in results for results in found.values())]
+    complete = [method for method in next(iter(found.values())) if all(method in rows for rows in found.values())]
     if arguments.baseline not in complete:
         note = f"no aggregate: it needs results of the baseline, {arguments.baseline}, on every family"
         return Tables(tables, (), (note,))
     from sb3_fedguide.benchmark.aggregate import aggregate
 
-    finals = {name: {method: [run.final for run in results[method]] for method in complete} for name, results in found.items()}
+    finals = {name: {method: [run.final for run in rows[method]] for method in complete} for name, rows in found.items()}
     means = {name: sum(values[arguments.baseline]) / len(values[arguments.baseline]) for name, values in finals.items()}
     levels = {name: (random_level(Path(arguments.folder), families[name]), means[name]) for name in found}
     if too_low := [f"{name} ({high:.4g}, random actions {low:.4g})" for name, (low, high) in levels.items() if not low < high]:
@@ -117,7 +124,7 @@ def make_tables(
     aggregates = [aggregate(method, {name: finals[name][method] for name in found}, levels) for method in complete]
     scale = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, (low, high) in levels.items())
     notes = [f"Scores are 0 for random actions and 1 for the mean of {arguments.baseline}: {scale}."]
-    if partial := sorted({method for results in found.values() for method in results} - set(complete)):
+    if partial := sorted({method for rows in found.values() for method in rows} - set(complete)):
         notes.append(f"Without {', '.join(partial)}, of which some families have no run.")
     return Tables(tables, aggregates, notes)
 

@@ -24,6 +24,8 @@ from sb3_fedguide.settings.config import read_yaml
 
 #: The training command; a run's flags follow.
 TRAIN = (sys.executable, "-m", "sb3_fedguide", "train")
+#: Inside the folder of a family's results: what runs need to go on.
+RUNS = "runs"
 #: Seconds between looks at the runs.
 POLL = 0.1
 #: Seconds between reports of what runs are doing.
@@ -71,6 +73,11 @@ class Outcome:
     content: Mapping[str, Any] | None = None
     problem: str = ""
     interrupted: bool = False
+
+
+def log_folder_of(result: Path) -> Path:
+    """What the training command of the run with this result file writes into."""
+    return result.parent / RUNS / result.stem
 
 
 def interrupted_folder(log_folder: Path, method: str) -> Path | None:

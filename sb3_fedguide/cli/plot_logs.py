@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.benchmark.figures.runs import Comparison, Run
+from sb3_fedguide.cli.run_folder import events_folder
 from sb3_fedguide.settings.config import read_yaml
 
 if TYPE_CHECKING:
@@ -73,7 +74,8 @@ def read_scalars(run: Run) -> Scalars:
     """
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    folder = _events_folder(run)
+    elsewhere = _settings(run.source, "args.yml").get("tensorboard_log")
+    folder = events_folder(run.source, elsewhere, run.family, run.method)
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
     keys = events.Tags()["scalars"]
@@ -81,11 +83,3 @@ def read_scalars(run: Run) -> Scalars:
         raise ValueError(f"{run.source} has no log of rounds in {folder}")
     rounds = {event.step: round(event.value) for event in events.Scalars(ROUND)}
     return {key: {rounds[event.step]: event.value for event in events.Scalars(key) if event.step in rounds} for key in keys}
-
-
-def _events_folder(run: Run) -> Path:
-    """``tb`` in the run's folder, or where ``--tensorboard-log`` has put the events."""
-    elsewhere = _settings(run.source, "args.yml").get("tensorboard_log")
-    if elsewhere is None:
-        return run.source / "tb"
-    return Path(elsewhere) / run.family / f"{run.method}_{run.source.name.rsplit('_', 1)[-1]}"

@@ -132,13 +132,10 @@ class Run:
         from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputFormat
 
         from sb3_fedguide.cli.round_table import RoundTable
+        from sb3_fedguide.cli.run_folder import events_folder
 
         arguments = self.arguments
-        # TensorBoard calls a run by the folder of its events, so they lie in the run's own; an earlier version's go on in tb
-        events = folder / "tb" if (folder / "tb").is_dir() else folder
-        if arguments.tensorboard_log is not None:
-            number = folder.name.rsplit("_", 1)[-1]
-            events = Path(arguments.tensorboard_log) / self.family.name / f"{arguments.algo}_{number}"
+        events = events_folder(folder, arguments.tensorboard_log, self.family.name, arguments.algo)
         loud = arguments.verbose == 2 or (arguments.verbose == 1 and not arguments.progress)
         events_output = TensorBoardOutputFormat(str(events))
         if self.folder is not None:

@@ -58,6 +58,19 @@ def create_run_folder(log_folder: Path, algo: str, family: str) -> Path:
             number += 1
 
 
+def events_folder(folder: Path, tensorboard_log: str | None, family: str, algo: str) -> Path:
+    """Where the TensorBoard events of the run in ``folder`` are.
+
+    TensorBoard calls a run by the folder of its events, so they lie in the run's own. Those of an earlier version lie in its
+    ``tb``, and go on there.
+
+    :param tensorboard_log: the folder that ``--tensorboard-log`` has named
+    """
+    if tensorboard_log is not None:
+        return Path(tensorboard_log) / family / f"{algo}_{folder.name.rsplit('_', 1)[-1]}"
+    return folder / "tb" if (folder / "tb").is_dir() else folder
+
+
 def parameter_file(trained: str) -> Path:
     """The file of what a run has learned, from its folder or its own path.
 

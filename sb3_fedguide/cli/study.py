@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_fedguide.cli.benchmark_arguments import PASSED_ON, parse_benchmark, train_flags
-from sb3_fedguide.cli.benchmark_results import require_results, results_of_rows
+from sb3_fedguide.cli.benchmark_results import require_results
 from sb3_fedguide.cli.study_file import Row, Study, read_study
 from sb3_fedguide.settings.names import check_names
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from fed_envs import Family
     from sb3_fedguide.benchmark.figures.runs import Comparison
     from sb3_fedguide.cli.benchmark import Plan
+    from sb3_fedguide.cli.benchmark_results import Results
     from sb3_fedguide.cli.benchmark_tables import Tables
 
 #: Inside the folder of all results: what studies end with.
@@ -58,12 +59,14 @@ def _plan(study: Study, arguments: argparse.Namespace, prog: str) -> Plan:
     names = [name for name in families if name in (arguments.envs or families)]
     check_names(arguments.envs, families, "family of the study:")
     _check_places(rows, names)
+    if not any(row.seeds and (row.families is None or set(row.families) & set(names)) for row in rows):
+        given = [flag for flag in ("--algos", "--envs", "--seeds") if getattr(arguments, flag.removeprefix("--"))]
+        raise ValueError(f"no run of the study is left by {' with '.join(given)}; give less of that")
     study = replace(study, rows=rows)
     chosen = {name: families[name] for name in names}
     in_tables = [row.in_tables for row in rows]
     if arguments.table_only:
-        require_results(arguments.folder, chosen, in_tables)
-        return Plan(chosen, in_tables, study=study)
+        return Plan(chosen, in_tables, results=require_results(arguments.folder, chosen, in_tables), study=study)
     parts = [
         _plan_row(row, [sources[name] for name in names if row.families is None or name in row.families], arguments, prog)
         for row in rows
@@ -101,7 +104,7 @@ def _part(row: Row, families: Mapping[str, Family], arguments: argparse.Namespac
 
 
 def _check_places(rows: Sequence[Row], families: Sequence[str]) -> None:
-    """:raises ValueError: for two rows whose results would be the same files, and where no run is left"""
+    """:raises ValueError: for two rows whose results would be the same files"""
     taken: dict[tuple[str, str, str], Row] = {}
     for row in rows:
         for family in row.families or families:
@@ -111,8 +114,6 @@ def _check_places(rows: Sequence[Row], families: Sequence[str]) -> None:
                     f"methods {other.name!r} and {row.name!r} are both {row.algo} with the label {row.label!r}, so that their "
                     "results would be the same files; give one of them a label of its own"
                 )
-    if not any(row.seeds for row in rows):
-        raise ValueError("--seeds leaves no run of the study")
 
 
 def _plan_row(row: Row, sources: Sequence[tuple[str, str]], arguments: argparse.Namespace, prog: str) -> Plan:
@@ -132,7 +133,7 @@ def _plan_row(row: Row, sources: Sequence[tuple[str, str]], arguments: argparse.
         raise ValueError(f"method {row.name!r}: {error}") from None
 
 
-def write_study(plan: Plan, arguments: argparse.Namespace, tables: Tables) -> None:
+def write_study(plan: Plan, arguments: argparse.Namespace, results: Results, tables: Tables) -> None:
     """Its tables in every form, and the figures that its results allow, beside the results.
 
     :raises OSError: where a file cannot be written
@@ -151,8 +152,8 @@ def write_study(plan: Plan, arguments: argparse.Namespace, tables: Tables) -> No
     from sb3_fedguide.benchmark.figures.layout import save
     from sb3_fedguide.cli.plot import OF_LOGS, drawable
 
-    figures, left_out = drawable(_comparison(plan, arguments), plan.families, arguments)
-    if plan.study.eval_average and (kept := _kept_runs(plan, arguments)):
+    figures, left_out = drawable(_comparison(plan, results), plan.families, arguments)
+    if plan.study.eval_average and (kept := _kept_runs(plan, results)):
         more, reasons = drawable(kept, plan.families, arguments, OF_LOGS)
         figures, left_out = figures + more, left_out + reasons
     for name, figure in figures:
@@ -162,17 +163,17 @@ def write_study(plan: Plan, arguments: argparse.Namespace, tables: Tables) -> No
     print(f"tables and {len(figures)} figures are in {folder}", file=sys.stderr)
 
 
-def _kept_runs(plan: Plan, arguments: argparse.Namespace) -> Comparison:
+def _kept_runs(plan: Plan, results: Results) -> Comparison:
     """The runs of the study whose folders are still there."""
-    from sb3_fedguide.cli.benchmark import RUNS
-    from sb3_fedguide.cli.benchmark_runs import interrupted_folder
+    from sb3_fedguide.cli.benchmark_runs import interrupted_folder, log_folder_of
     from sb3_fedguide.cli.plot_runs import read_run_folder
 
     variants, found = _variants(plan), {}
-    for family, results in results_of_rows(arguments.folder, plan.families, plan.rows).items():
-        method = {row.name: row.method for row in plan.rows}
-        places = {name: [result.path.parent / RUNS / result.path.stem for result in group] for name, group in results.items()}
-        folders = {name: [interrupted_folder(place, method[name]) for place in group] for name, group in places.items()}
+    for family, rows in results.items():
+        folders = {
+            name: [interrupted_folder(log_folder_of(result.path), result.method) for result in group]
+            for name, group in rows.items()
+        }
         runs = {
             name: [replace(read_run_folder(path), name=name, variant=variants[name]) for path in group if path is not None]
             for name, group in folders.items()
@@ -187,13 +188,12 @@ def _variants(plan: Plan) -> dict[str, int]:
     return {row.name: methods[:place].count(row.method) for place, row in enumerate(plan.rows)}
 
 
-def _comparison(plan: Plan, arguments: argparse.Namespace) -> Comparison:
+def _comparison(plan: Plan, results: Results) -> Comparison:
     from sb3_fedguide.benchmark.figures.runs import from_result
 
     variants = _variants(plan)
-    found = results_of_rows(arguments.folder, plan.families, plan.rows)
     return {
-        family: {name: [from_result(result, name, variants[name]) for result in group] for name, group in results.items()}
-        for family, results in found.items()
-        if results
+        family: {name: [from_result(result, name, variants[name]) for result in group] for name, group in rows.items()}
+        for family, rows in results.items()
+        if rows
     }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,15 +11,16 @@ from typing import Annotated, Any
 
 import pydantic
 
-from sb3_fedguide.cli.benchmark_arguments import FOLDER, check_once
+from sb3_fedguide.cli.benchmark_arguments import AT_ROUNDS, BASELINE, FOLDER, check_once
 from sb3_fedguide.cli.benchmark_results import SEEDS, TableRow
 from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.settings.config import CONFIGURATIONS, NESTED, read_yaml
 from sb3_fedguide.settings.names import check_names
+from sb3_fedguide.settings.pretraining import Count
 from sb3_fedguide.settings.schema import check_model
 
-Count = Annotated[int, pydantic.Field(ge=1, lt=2**31)]
 Seed = Annotated[int, pydantic.Field(ge=0, lt=2**31)]
+AtLeastOne = pydantic.Field(min_length=1)
 
 
 class MethodEntry(pydantic.BaseModel):
@@ -40,8 +40,8 @@ class MethodEntry(pydantic.BaseModel):
     conf: str | None = None
     label: str | None = None
     params: dict[str, Any] = {}
-    seeds: list[Seed] | None = None
-    families: list[str] | None = None
+    seeds: Annotated[list[Seed], AtLeastOne] | None = None
+    families: Annotated[list[str], AtLeastOne] | None = None
     delays: str | None = None
 
 
@@ -67,7 +67,7 @@ class StudyFile(pydantic.BaseModel):
     methods: dict[str, dict[str, Any] | None] = {}
     families: list[str] = []
     metadata: list[str] = []
-    seeds: list[Seed] = list(SEEDS)
+    seeds: Annotated[list[Seed], AtLeastOne] = list(SEEDS)
     rounds: Count | None = None
     conf: str = "tuned"
     label: str | None = None
@@ -76,8 +76,8 @@ class StudyFile(pydantic.BaseModel):
     eval_freq: Count | None = None
     eval_episodes: Count | None = None
     eval_average: bool = False
-    baseline: str = "local"
-    at_rounds: list[Count] = [25, 50]
+    baseline: str = BASELINE
+    at_rounds: list[Count] = list(AT_ROUNDS)
     overview: list[str] = ["F"]
     folder: str | None = None
     processes: Count | None = None
@@ -150,7 +150,7 @@ def _study(path: Path, content: Any) -> Study:
     if not file.families and not file.metadata:
         raise ValueError("families is missing: give names such as [HopperHard], or metadata files")
     rows = [_row(path, file, name, entry or {}) for name, entry in file.methods.items()]
-    check_names([file.baseline], [row.name for row in rows] + ["local"], "row as baseline:")
+    check_names([file.baseline], [row.name for row in rows] + [BASELINE], "row as baseline:")
     check_names(file.overview, columns_of(), "column in overview:")
     return Study(
         name=path.stem,
@@ -172,6 +172,8 @@ def _study(path: Path, content: Any) -> Study:
 def _row(path: Path, file: StudyFile, name: str, entry: Mapping[str, Any]) -> Row:
     own = check_model(f"method {name!r}", MethodEntry, entry, {})
     assert isinstance(own, MethodEntry)
+    if not name.strip():
+        raise ValueError(f"a method has the name {name!r}; give its row of the tables one, such as local")
     if "|" in name or "\n" in name:
         raise ValueError(f"method {name!r} is to be a row of a table; give it a name without | and line breaks")
     if own.algo is None and (first := name.split()[0]) in ALGORITHMS and first != name:
@@ -183,7 +185,7 @@ def _row(path: Path, file: StudyFile, name: str, entry: Mapping[str, Any]) -> Ro
     label = own.label or file.label or Path(conf).stem
     flags = ["-conf", conf, "--label", label]
     params = {**dict(_dotted(file.params)), **dict(_dotted(own.params))}
-    flags += ["-params", *(f"{key}:{_scalar(value)}" for key, value in params.items())] if params else []
+    flags += ["-params", *(_flag_value(name, key, value) for key, value in params.items())] if params else []
     given = {"rounds": file.rounds, "delays": own.delays or file.delays}
     for flag, value in given.items():
         flags += [] if value is None else [f"--{flag}", str(value)]
@@ -205,7 +207,14 @@ def _dotted(params: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield name, value
 
 
-def _scalar(value: Any) -> str:
-    """As YAML that is read as the same value again."""
-    plain = isinstance(value, str) and re.fullmatch(r"[a-z]+_[\d.]+", value)
-    return value if plain else json.dumps(value)
+def _flag_value(method: str, key: str, value: Any) -> str:
+    """A hyperparameter for ``-params``, as YAML that is read as the same value again.
+
+    :raises ValueError: for a date and whatever else YAML has and no hyperparameter can be
+    """
+    try:
+        return f"{key}:{json.dumps(value, ensure_ascii=False)}"
+    except TypeError:
+        raise ValueError(
+            f"method {method!r}: params.{key} must be made of numbers, texts, lists and mappings, but it is {value}"
+        ) from None

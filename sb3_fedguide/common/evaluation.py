@@ -17,6 +17,7 @@ from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.episodes import truth
 from sb3_fedguide.seeding import EVALUATION_SEED, Role
 from sb3_fedguide.server.metrics import EVALUATION_COLUMNS, evaluation_row
+from sb3_fedguide.settings.evaluation import EVAL_EPISODES, EVAL_FREQ, broadcast_is_due, deployed_is_due
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
@@ -141,13 +142,11 @@ class FederatedEvalCallback(RoundCallback):
     :param max_steps: of an episode, as in :func:`evaluate_federation`
     """
 
-    LAST_ROUNDS = 20
-
     def __init__(
         self,
         n_rounds: int,
-        eval_freq: int = 5,
-        n_episodes: int = 10,
+        eval_freq: int = EVAL_FREQ,
+        n_episodes: int = EVAL_EPISODES,
         csv_path: str | Path | None = None,
         deterministic: bool = True,
         max_steps: int = MAX_STEPS,
@@ -182,7 +181,7 @@ class FederatedEvalCallback(RoundCallback):
 
     def is_due(self, round: int) -> bool:
         """Whether the deployed policies are evaluated after the local training of round ``round``, counted from 1."""
-        return round % self.eval_freq == 0 or round > self.n_rounds - self.LAST_ROUNDS
+        return deployed_is_due(round, self.n_rounds, self.eval_freq)
 
     def _on_local_training_end(self) -> None:
         round = self.model.round + 1
@@ -203,7 +202,7 @@ class FederatedEvalCallback(RoundCallback):
         round = self.model.round
         if not self.model.sends_policy(round):
             self.last.pop("broadcast", None)  # nobody has that policy any more
-        elif round % self.eval_freq == 0 or round == self.n_rounds:
+        elif broadcast_is_due(round, self.n_rounds, self.eval_freq):
             evaluation = self._evaluate("broadcast", round)
             self.logger.record("eval/broadcast_mean_reward", evaluation.average)
             self.logger.record("eval/averaging_change", evaluation.average - self.last["deployed"].average)

@@ -19,6 +19,7 @@ from sb3_fedguide.server.averaging import (
     averaging_is_due,
     check_aggregator,
     check_averaging,
+    policy_is_due,
 )
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload
 
@@ -117,8 +118,7 @@ class ParameterAveraging(Federation):
         return averaged_prefixes(self.average, self.policy.actor_prefixes, self.policy.critic_prefixes)
 
     def sends_policy(self, round: int) -> bool:
-        due = averaging_is_due(round, self.average_every, self.average_until)
-        return self.average != "critic" and due and self.mix_now() > 0
+        return policy_is_due(round, self.average, self.average_every, self.average_until) and self.mix_now() > 0
 
     def upload(self, index: int) -> Payload:
         payload = super().upload(index)

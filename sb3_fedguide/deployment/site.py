@@ -25,6 +25,7 @@ from sb3_fedguide.registry import algorithm_name
 from sb3_fedguide.server.metrics import ClientEvaluation
 from sb3_fedguide.server.payload import Payload
 from sb3_fedguide.server.trunk import MOMENTS, TRUNK
+from sb3_fedguide.settings.evaluation import EVAL_EPISODES, EVAL_FREQ, broadcast_is_due
 from sb3_fedguide.state.array_files import take_prefix
 from sb3_fedguide.state.checkpoint_files import newest_checkpoint, remove_leftovers, write_checkpoint
 
@@ -60,8 +61,8 @@ class Site:
         model: Federation,
         n_rounds: int,
         folder: str | Path,
-        eval_freq: int | None = 5,
-        n_episodes: int = 10,
+        eval_freq: int | None = EVAL_FREQ,
+        n_episodes: int = EVAL_EPISODES,
         report: bool = True,
     ) -> None:
         if model.n_clients != 1:
@@ -237,7 +238,7 @@ class Site:
         self._learn()
         self.model.take_broadcasts({0: message.payload})
         self.n_received = number
-        due = self._evaluation is not None and (after % self._evaluation.eval_freq == 0 or after == self.n_rounds)
+        due = self._evaluation is not None and broadcast_is_due(after, self.n_rounds, self._evaluation.eval_freq)
         return [self._evaluated("broadcast", after)] if due and after > 0 and self.model.sends_policy(after) else []
 
     def _evaluated(self, policy: str, round: int) -> dict[str, Any]:

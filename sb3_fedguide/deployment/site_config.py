@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 import fed_envs
 from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.settings.config import resolve
+from sb3_fedguide.settings.evaluation import EVAL_EPISODES, EVAL_FREQ
 from sb3_fedguide.settings.names import check_names
 from sb3_fedguide.settings.schema import check_model
 
@@ -47,8 +48,8 @@ class SiteConfig(BaseModel):
     conf: str = "tuned"
     params: dict[str, Any] = {}
     n_rounds: Count | None = None
-    eval_freq: Annotated[int, Field(ge=0)] = 5
-    eval_episodes: Count = 10
+    eval_freq: Annotated[int, Field(ge=0)] = EVAL_FREQ
+    eval_episodes: Count = EVAL_EPISODES
     report: bool = True
     cache_dir: str | None = None
     num_threads: Count = 1

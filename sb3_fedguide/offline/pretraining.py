@@ -30,7 +30,7 @@ from sb3_fedguide.offline.trunk import TrunkTraining, federated_trunk
 from sb3_fedguide.priors import DiffusionPrior, GaussianPrior, HeadStatistics, Prior
 from sb3_fedguide.seeding import Role, stream
 from sb3_fedguide.server.trunk import MOMENTS, TRUNK
-from sb3_fedguide.settings.pretraining import Piece, PretrainingConfig
+from sb3_fedguide.settings.pretraining import Piece, PretrainingConfig, prior_is_gaussian
 from sb3_fedguide.state.array_files import take_prefix
 from sb3_fedguide.state.stacked import to_tensors
 
@@ -354,8 +354,7 @@ class Pretraining:
 
 def untrained_prior(family: Family | None, config: PretrainingConfig, obs_dim: int, action_dim: int, seed: int) -> Prior:
     """The common part of the priors as it is before training, the same wherever it is made."""
-    automatic = "gaussian" if family is not None and family.world == "bandit2d" else "diffusion"
-    if (automatic if config.prior == "auto" else config.prior) == "gaussian":
+    if prior_is_gaussian(config.prior, None if family is None else family.world):
         return GaussianPrior(obs_dim, action_dim)
     return DiffusionPrior(obs_dim, action_dim, width=config.prior_width, rng=stream(seed, Role.TRUNK))
 

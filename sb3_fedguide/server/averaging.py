@@ -85,6 +85,11 @@ def averaging_is_due(round: int, every: int, until: int | None = None) -> bool:
     return round > 0 and round % every == 0 and (until is None or round <= until)
 
 
+def policy_is_due(round: int, average: str, every: int, until: int | None = None) -> bool:
+    """Whether what is averaged after round ``round`` are policies, not critics alone."""
+    return average != "critic" and averaging_is_due(round, every, until)
+
+
 AVERAGE_CHOICES = ("all", "actor", "critic")
 
 

@@ -7,13 +7,22 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["Piece", "PretrainingConfig"]
+__all__ = ["Count", "Piece", "PretrainingConfig", "prior_is_gaussian"]
 
 Count = Annotated[int, Field(ge=1, lt=2**31)]
 Size = Annotated[int, Field(ge=1, le=10_000_000)]  # far above what is useful, and below what no memory holds
 Width = Annotated[int, Field(ge=1, le=8192)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Piece = Literal["bc", "prior", "dice"]
+
+
+def prior_is_gaussian(prior: str, world: str | None) -> bool:
+    """Whether a prior is the Gaussian one: that of Bandit2D, if nothing is said.
+
+    :param prior: as in :class:`PretrainingConfig`
+    :param world: of the family; ``None`` for environments of one's own
+    """
+    return prior == "gaussian" or (prior == "auto" and world == "bandit2d")
 
 
 class PretrainingConfig(BaseModel):

@@ -14,7 +14,8 @@ from matplotlib.lines import Line2D
 from sb3_fedguide.benchmark.figures.layout import MEDIUM, SMALL, fit_scale, legend, panels
 from sb3_fedguide.benchmark.figures.runs import Comparison, Runs, base, require_finished, seeds
 from sb3_fedguide.benchmark.figures.styles import style
-from sb3_fedguide.benchmark.results import LAST_ROUNDS, measure, speed_up, volatility
+from sb3_fedguide.benchmark.results import measure, speed_up, volatility
+from sb3_fedguide.settings.evaluation import LAST_ROUNDS
 
 ROW = 0.27  # inches of one bar
 _DOT: dict[str, Any] = {

@@ -1,0 +1,20 @@
+"""When a run evaluates its policies. Imports nothing heavy."""
+
+from __future__ import annotations
+
+#: Rounds between evaluations, where nothing else is said.
+EVAL_FREQ = 5
+#: Episodes per client of an evaluation, where nothing else is said.
+EVAL_EPISODES = 10
+#: So many rounds at the end of a run are all evaluated, and CV is taken over them.
+LAST_ROUNDS = 20
+
+
+def deployed_is_due(round: int, n_rounds: int, eval_freq: int) -> bool:
+    """Whether the deployed policies are evaluated after the local training of round ``round``, counted from 1."""
+    return round % eval_freq == 0 or round > n_rounds - LAST_ROUNDS
+
+
+def broadcast_is_due(round: int, n_rounds: int, eval_freq: int) -> bool:
+    """Whether a policy that the server sends after round ``round`` is evaluated."""
+    return round % eval_freq == 0 or round == n_rounds
