@@ -21,9 +21,9 @@ from sb3_fedguide.cli import hub, pull
 from sb3_fedguide.cli.main import main
 from sb3_fedguide.cli.model_card import write_card
 from sb3_fedguide.state.array_files import read_arrays, write_arrays
+from tests.command_lines import check_command, commands
 from tests.crafted_files import crafted_npz
 from tests.fake_hub import COMMIT, TOKEN, FakeHub
-from tests.test_docs import check_command, commands
 
 pytest.importorskip("huggingface_hub")
 
