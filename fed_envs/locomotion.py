@@ -151,7 +151,7 @@ class LocomotionEnv(MujocoClientEnv[LocomotionClient]):
     The backbone's: Hopper and Walker2D terminate when unhealthy, HalfCheetah never; 1000 steps.
 
     ## Arguments
-    Those of :class:`fed_envs.world.ClientEnv` and ``width``, ``height``; any field of
+    Those of :class:`fed_envs.world.ClientEnv` and ``width``, ``height``, ``camera``; any field of
     :class:`fed_envs.clients.LocomotionClient` as a keyword replaces the client's own, e.g. ``floor_priority=True``: MuJoCo
     takes the larger friction of two touching geoms, so that a slippery floor under a foot of friction 2.0 changes nothing
     unless the floor has priority.

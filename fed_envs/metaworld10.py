@@ -140,7 +140,7 @@ class MetaWorldEnv(MujocoClientEnv[MetaWorldClient]):
     Never terminates; 500 steps.
 
     ## Arguments
-    Those of :class:`fed_envs.world.ClientEnv` and ``width``, ``height``; any field of
+    Those of :class:`fed_envs.world.ClientEnv` and ``width``, ``height``, ``camera``; any field of
     :class:`fed_envs.clients.MetaWorldClient` as a keyword replaces the client's own, e.g. ``fixed_goal=True``. ``model``
     is shared with other environments of the task: do not change it.
 

@@ -30,6 +30,8 @@ class MujocoClientEnv(ClientEnv[ClientT]):
 
     :param width: width of rendered images in pixels
     :param height: height of rendered images in pixels
+    :param camera: MuJoCo's settings of the camera that takes them, e.g. ``{"distance": 4.0, "azimuth": 90.0}``, instead of the
+        world's own camera
     """
 
     #: a camera of the model that pictures are taken by, instead of one with the settings of :meth:`_camera`
@@ -37,9 +39,11 @@ class MujocoClientEnv(ClientEnv[ClientT]):
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}  # noqa: RUF012
     _batch: MujocoBatch[Any]
 
-    def __init__(self, *args: Any, width: int = 480, height: int = 480, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, width: int = 480, height: int = 480, camera: dict[str, Any] | None = None, **kwargs: Any
+    ) -> None:
         super().__init__(*args, **kwargs)
-        self.width, self.height = width, height
+        self.width, self.height, self.camera = width, height, camera
         self._renderer: Any = None
 
     def _build(self, model: str | mujoco.MjModel, frame_skip: int, observation_dim: int) -> None:
@@ -106,8 +110,15 @@ class MujocoClientEnv(ClientEnv[ClientT]):
 
             screen = self.model.vis.global_
             screen.offwidth, screen.offheight = max(screen.offwidth, self.width), max(screen.offheight, self.height)
-            settings = {"camera_name": self.camera_name} if self.camera_name else {"camera_id": -1}
-            self._renderer = MujocoRenderer(self.model, self.data, self._camera(), self.width, self.height, **settings)
+            free = self.camera is not None or self.camera_name is None
+            self._renderer = MujocoRenderer(
+                self.model,
+                self.data,
+                self._camera() if self.camera is None else self.camera,
+                self.width,
+                self.height,
+                **({"camera_id": -1} if free else {"camera_name": self.camera_name}),
+            )
         return self._renderer.render(self.render_mode)
 
     def close(self) -> None:

@@ -82,7 +82,6 @@ def test_the_containers_run_the_commands_that_there_are() -> None:
         assert service["cap_drop"] == ["ALL"] and service["read_only"] is True
 
 
-@pytest.mark.slow
 def test_docker_compose_takes_the_file() -> None:
     for program in (["docker", "compose"], ["docker-compose"]):
         if shutil.which(program[0]) and not subprocess.run([*program, "version"], capture_output=True, check=False).returncode:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sb3_fedguide.benchmark.figures.bars import draw_bars, draw_speed_up
-from sb3_fedguide.benchmark.figures.clients import client_returns, share_of_best
+from sb3_fedguide.benchmark.figures.clients import client_returns, draw_clients, share_of_best
 from sb3_fedguide.benchmark.figures.comparisons import (
     improvement_interval,
     performance_profile,
@@ -115,6 +115,9 @@ def test_clients_below_60_percent_of_their_best_are_stuck(tmp_path):
     assert found.mean.tolist() == [[7.0, -12.5, -0.5], [6.05, -14.0, 0.0]]
     assert found.share[0].tolist() == [pytest.approx(0.7), pytest.approx(0.75), -np.inf]
     assert share_of_best(np.array([0.0]), np.array([0.0])).tolist() == [1.0]
+    figure = draw_clients("Mine", {name: [from_result(one) for one in group] for name, group in results.items()})
+    assert [text.get_text() for text in figure.axes[0].texts[:2]] == ["7.00\n1 of 2", "-12.5\n1 of 2"]
+    assert figure.axes[0].get_xticklabels()[0].get_text() == "3\n10.0"
     with pytest.raises(ValueError, match="does not say the clients' final returns"):
         client_returns({"local": [read_result(write_result(tmp_path / "old"))]})
 

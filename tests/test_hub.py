@@ -16,9 +16,12 @@ import numpy as np
 import pytest
 import yaml
 
+import fed_envs
 from sb3_fedguide.cli import hub, pull
 from sb3_fedguide.cli.main import main
+from sb3_fedguide.cli.model_card import write_card
 from sb3_fedguide.state.array_files import read_arrays, write_arrays
+from tests.command_lines import check_command, commands
 from tests.crafted_files import crafted_npz
 from tests.fake_hub import COMMIT, TOKEN, FakeHub
 
@@ -136,6 +139,33 @@ def test_the_card_says_what_the_run_is_and_how_to_use_it(service, run):
 
     card = ModelCard(service.repositories["me/bandit"]["README.md"].decode())  # the hub's own reading of it
     assert card.data.eval_results is not None and card.data.eval_results[0].dataset_name == "Bandit2D"
+
+
+BANDIT, GYMNASIUM = fed_envs.load_family("Bandit2D"), fed_envs.gymnasium_family("Pendulum-v1", [{}] * 4)
+
+
+@pytest.mark.parametrize(
+    ("family", "packages", "clients"),
+    [
+        (BANDIT, [], "--env Bandit2D"),
+        (BANDIT, ["mine", "mine.more"], "--env Bandit2D --gym-packages mine mine.more"),
+        (fed_envs.Family.model_validate({**BANDIT.to_dict(), "clients": BANDIT.clients[:2]}), [], "--metadata {there}"),
+        (GYMNASIUM, ["robots"], "--metadata {there} --gym-packages robots"),
+    ],
+    ids=["a shipped family", "with modules", "another of its name", "registered ids"],
+)
+def test_the_cards_commands_are_understood(family, packages, clients, run):
+    summary = {**json.loads((run / "summary.json").read_text()), "env": family.name}
+    card = write_card(run, "me/run", summary, family, packages)
+    found = commands(card)
+    for words in found:
+        check_command(words)
+    assert [words[1] for words in found] == ["pull", "evaluate", "export", "train"]
+    there = f"logs/fedavg/{family.name}_1"
+    start = f"fedguide train -i {there} --algo fedavg {clients.format(there=f'{there}/metadata.json')}"
+    assert found[-1] == start.split()
+    extras = re.search(r"pip install 'sb3-fedguide\[(.*)]'", card)
+    assert extras is not None and {"hub", "onnx"} == set(extras[1].split(",")) and found[2][-2:] == ["sb3", "onnx"]
 
 
 def test_a_second_push_removes_what_the_run_does_not_have(service, run, tmp_path):
@@ -333,6 +363,33 @@ def test_sizes_are_bounded_before_and_while_a_file_comes(service, shared, monkey
     service.said_sizes = {"versions.json": 10}
     shared["versions.json"] = b" " * (hub.FILES["versions.json"] + pull.CHUNK)
     assert "versions.json of me/run is longer than the 100000 bytes that are taken" in refused(pulling, capsys)
+    assert_nothing_stays(tmp_path / "logs")
+
+
+def test_push_says_itself_what_pull_would_refuse(service, run, tmp_path, capsys):
+    other = shutil.copytree(run, tmp_path / "run")
+    clients = [{"client": k, "id": "Pendulum-v1", "kwargs": {"map": "maps/of:mine"}} for k in range(4)]
+    (other / "metadata.json").write_bytes(of_gymnasium(json.loads((run / "metadata.json").read_text()), clients))
+    message = refused(["push", str(other), "me/bandit"], capsys)
+    assert "nothing is sent, since 'fedguide pull' would refuse the run: client 0 of " in message
+    assert "the keyword argument 'maps/of:mine', which may name a file or a module; register" in message
+    assert service.requests == []
+
+
+@pytest.mark.parametrize(
+    ("command", "part"),
+    [
+        ("pull me/run -f {logs}", "sb3_fedguide.cli.pull._download"),
+        ("push {run} me/bandit", "huggingface_hub.CommitOperationAdd"),
+    ],
+)
+def test_a_fault_of_this_package_is_not_the_hubs(command, part, service, shared, run, tmp_path, monkeypatch):
+    def fault(*_, **__):
+        raise TypeError("a fault here")
+
+    monkeypatch.setattr(part, fault)
+    with pytest.raises(TypeError, match="a fault here"):
+        main([word.format(run=run, logs=tmp_path / "logs") for word in command.split()])
     assert_nothing_stays(tmp_path / "logs")
 
 

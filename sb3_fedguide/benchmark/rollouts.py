@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +34,8 @@ class Episode:
     :param positions: horizontal position of a walking body, ``(n_steps + 1,)``; empty in other worlds
     :param rewards: ``(n_steps,)``
     :param seconds: simulated, of a step; 0 where the environment does not say
+    :param rate: steps per second of a video that shows them at their own speed
+    :param seed: of its start
     """
 
     client: int
@@ -42,6 +44,8 @@ class Episode:
     positions: np.ndarray
     rewards: np.ndarray
     seconds: float
+    rate: float
+    seed: int
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -52,17 +56,15 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """Of one episode.
+class Poses:
+    """Pictures of one episode.
 
     :param frames: ``(n_pictures, height, width, 3)`` uint8
     :param background: the same without what moves, ``(height, width, 3)``; ``None`` where it was not drawn
-    :param rate: pictures per second of simulated time, if every step had one
     """
 
     frames: np.ndarray
     background: np.ndarray | None
-    rate: float
 
 
 def record(
@@ -91,10 +93,10 @@ def record(
             positions.append(_position(body))
         rewards.append(float(reward))
         done = terminated or truncated
-    seconds = float(getattr(body, "dt", 0.0))
+    seconds, rate = float(getattr(body, "dt", 0.0)), float(env.metadata.get("render_fps", 30))
     env.close()
     plain = np.array(observations) if isinstance(obs, np.ndarray) else np.empty(0)
-    return Episode(client, plain, np.array(actions), np.array(positions), np.array(rewards), seconds)
+    return Episode(client, plain, np.array(actions), np.array(positions), np.array(rewards), seconds, rate, seed)
 
 
 def _position(body: Any) -> float:
@@ -108,51 +110,53 @@ def pose_steps(episode: Episode, n_poses: int = N_POSES) -> list[int]:
         way = episode.positions - episode.positions[0]
         outside = np.flatnonzero((way > GROUND) | (way < -BEHIND))
         last = int(outside[0]) if len(outside) else last
-    return sorted({round(step) for step in np.linspace(0, last, n_poses)})
+    return evenly(last, n_poses)
 
 
-def pictures(
-    family: Family,
-    episode: Episode,
-    steps: Sequence[int],
-    size: tuple[int, int] | None = None,
-    seed: int = EVALUATION_SEED,
-) -> Pictures:
-    """Pictures of an episode after ``steps`` of its steps, by playing its actions again.
+def evenly(last: int, n: int) -> list[int]:
+    """Up to ``n`` steps from 0 to ``last``, with both, evenly spaced."""
+    return sorted({round(step) for step in np.linspace(0, last, n)})
 
-    :param size: width and height in pixels, for one picture of many poses: a walking body is then seen by a camera that stays
-        where it is, and Reacher's arm from above. By default worlds choose size and camera
+
+def pictures(family: Family, episode: Episode, steps: Sequence[int]) -> Iterator[np.ndarray]:
+    """Pictures of an episode after ``steps`` of its steps, by playing its actions again; one at a time.
+
+    :return: ``(height, width, 3)`` uint8
     """
-    sized = {"width": size[0], "height": size[1]} if size is not None and family.world in _SIZED else {}
+    env = family.make(episode.client, render_mode="rgb_array")
+    try:
+        yield from _photographs(env, episode, steps)
+    finally:
+        env.close()
+
+
+def poses(family: Family, episode: Episode, steps: Sequence[int], size: tuple[int, int]) -> Poses:
+    """Pictures for one that shows many poses.
+
+    A walking body is seen by a camera that stays where it is, and Reacher's arm from above.
+
+    :param size: width and height in pixels; worlds that choose theirs keep it
+    """
+    camera = _CAMERAS[family.world](episode, size) if family.world in _CAMERAS else None
+    sized = {"width": size[0], "height": size[1], "camera": camera} if family.world in _SIZED else {}
     env = family.make(episode.client, render_mode="rgb_array", **sized)
-    env.reset(seed=seed)
-    renderer = None
-    if size is not None and family.world in _CAMERAS:
-        renderer = _renderer(env, _CAMERAS[family.world](episode, size), size)
-    found = []
+    frames = np.stack(list(_photographs(env, episode, steps)))
+    background = None
+    if camera is not None:
+        body: Any = env.unwrapped
+        body.model.geom_rgba[body.model.geom_bodyid > 0, 3] = 0.0  # all that moves
+        background = np.asarray(env.render(), dtype=np.uint8)
+    env.close()
+    return Poses(frames, background)
+
+
+def _photographs(env: gymnasium.Env, episode: Episode, steps: Sequence[int]) -> Iterator[np.ndarray]:
+    env.reset(seed=episode.seed)
     for step in range(max(steps) + 1):
         if step:
             env.step(episode.actions[step - 1])
         if step in steps:
-            found.append(np.asarray(env.render() if renderer is None else renderer.render("rgb_array"), dtype=np.uint8))
-    background = None
-    if renderer is not None:
-        body: Any = env.unwrapped
-        body.model.geom_rgba[body.model.geom_bodyid > 0, 3] = 0.0  # all that moves
-        background = np.asarray(renderer.render("rgb_array"), dtype=np.uint8)
-        renderer.close()
-    rate = float(env.metadata.get("render_fps", 30))
-    env.close()
-    return Pictures(np.stack(found), background, rate)
-
-
-def _renderer(env: gymnasium.Env, camera: dict[str, Any], size: tuple[int, int]) -> Any:
-    from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer  # needs OpenGL
-
-    body: Any = env.unwrapped
-    screen = body.model.vis.global_
-    screen.offwidth, screen.offheight = max(screen.offwidth, size[0]), max(screen.offheight, size[1])
-    return MujocoRenderer(body.model, body.data, camera, *size, camera_id=-1)
+            yield np.asarray(env.render(), dtype=np.uint8)
 
 
 def _from_the_side(episode: Episode, size: tuple[int, int]) -> dict[str, Any]:
@@ -175,7 +179,7 @@ _SIZED = ("locomotion", "reacher", "metaworld10")
 _CAMERAS = {"locomotion": _from_the_side, "reacher": _from_above}
 
 
-def overlay(pictures: Pictures, faintest: float = 0.25, threshold: int = 14) -> np.ndarray:
+def overlay(poses: Poses, faintest: float = 0.25, threshold: int = 14) -> np.ndarray:
     """All poses in one picture: the later, the stronger.
 
     Where there is no background, it is what most of the pictures have at a pixel.
@@ -184,8 +188,8 @@ def overlay(pictures: Pictures, faintest: float = 0.25, threshold: int = 14) -> 
     :param threshold: difference from the background from which a pixel belongs to a pose
     :return: ``(height, width, 3)`` uint8
     """
-    frames = pictures.frames
-    background = np.median(frames, axis=0) if pictures.background is None else pictures.background.astype(float)
+    frames = poses.frames
+    background = np.median(frames, axis=0) if poses.background is None else poses.background.astype(float)
     picture = background.copy()
     for frame, strength in zip(frames, np.linspace(faintest, 1.0, len(frames)) if len(frames) > 1 else [1.0], strict=True):
         pose = np.abs(frame - background).max(axis=-1) > threshold

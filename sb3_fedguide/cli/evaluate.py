@@ -74,7 +74,8 @@ def _parser(prog: str) -> OneLineParser:
          "of your own")  # fmt: skip
     flag("--stochastic", action="store_true", help="sample actions instead of taking their mean")
     flag("-o", "--output", metavar="FILE", help="write the JSON there instead of to the terminal")
-    flag("--video", metavar="DIR", help="write a video of each client's first episode there")
+    flag("--video", metavar="DIR", help="write a video of one deterministic episode of each client there, which is "
+         "not among those that are evaluated")  # fmt: skip
     flag("--video-format", choices=FORMATS, default="gif", help="gif, or mp4, which needs pip install 'sb3-fedguide[video]'")
     return parser
 
@@ -150,7 +151,7 @@ def _evaluate(
             )
             if arguments.video is not None:
                 written = write_videos(
-                    Path(arguments.video), name, run["algo"], family, model, arguments.video_format, arguments.seed
+                    Path(arguments.video), name, run["algo"], family, model, arguments.seed, arguments.video_format
                 )
                 print(*(f"wrote {path}" for path in written), sep="\n", file=sys.stderr)
         env.close()

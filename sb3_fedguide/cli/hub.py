@@ -44,6 +44,10 @@ MAX_ENVIRONMENTS = 4096
 MAX_UNUSED = 50_000_000
 
 
+class RefusedError(ValueError):
+    """A run may be sound, but ``fedguide pull`` would not make its environments or networks here."""
+
+
 def hub_api() -> HfApi:
     """:raises ValueError: without the package ``huggingface_hub``"""
     if importlib.util.find_spec("huggingface_hub") is None:
@@ -92,6 +96,16 @@ def hub_errors(api: HfApi, repository: str, revision: str | None = None) -> Iter
         raise ValueError(f"{api.endpoint} cannot be reached ({error or type(error).__name__}); is there a network?") from None
     except RuntimeError as error:  # an upload that broke, whose cause says why
         raise ValueError(f"{api.endpoint}: {error} ({error.__cause__ or type(error).__name__})") from None
+
+
+@contextmanager
+def hub_answers(api: HfApi) -> Iterator[None]:
+    """Around nothing but requests and the reading of their answers: these may be another service's.
+
+    :raises ValueError: for an answer that the hub does not give
+    """
+    try:
+        yield
     except (KeyError, TypeError, AttributeError, json.JSONDecodeError) as error:
         raise ValueError(f"{api.endpoint} does not answer as the hub does ({error!r}); check HF_ENDPOINT") from None
 
@@ -101,10 +115,11 @@ def check_run(folder: Path, packages: Sequence[str]) -> tuple[dict[str, Any], Co
 
     :param packages: modules that register its algorithm or world
     :return: its ``summary.json``, hyperparameters and family
-    :raises ValueError: for a folder of something else, or whose settings claim more than its arrays have
+    :raises RefusedError: for settings that claim more than its arrays have, or may name files
+    :raises ValueError: for a folder of something else
     """
     from sb3_fedguide.cli.saved_run import load_model, read_deployed_policies, read_run
-    from sb3_fedguide.cli.train import import_packages
+    from sb3_fedguide.settings.packages import import_packages
 
     import_packages(packages)
     run, config, family = read_run(folder)
@@ -116,12 +131,12 @@ def check_run(folder: Path, packages: Sequence[str]) -> tuple[dict[str, Any], Co
 def _check_claims(folder: Path, config: Config, family: Family) -> None:
     """Before anything is made of them: a few bytes of settings can ask for more than any machine has.
 
-    :raises ValueError: where they do, or where environments of Gymnasium's are to read files
+    :raises RefusedError: where they do, or where environments of Gymnasium's may read files
     """
     values = config.values
     n_envs = family.n_clients * values["n_envs_per_client"]
     if n_envs > MAX_ENVIRONMENTS:
-        raise ValueError(
+        raise RefusedError(
             f"{folder} asks for {n_envs} environments; at most {MAX_ENVIRONMENTS} are made of somebody's settings"
         )
     layers = values["policy_kwargs"]["net_arch"] or []
@@ -130,11 +145,11 @@ def _check_claims(folder: Path, config: Config, family: Family) -> None:
     claimed = family.n_clients * sum(sum(widths) + sum(a * b for a, b in pairwise(widths)) for widths in networks)
     held = (folder / PARAMETERS).stat().st_size // 4
     if claimed > held + MAX_UNUSED:
-        raise ValueError(f"{folder} asks for networks of {claimed} numbers, but its {PARAMETERS} has no more than {held}")
+        raise RefusedError(f"{folder} asks for networks of {claimed} numbers, but its {PARAMETERS} has no more than {held}")
     for client in family.clients:
         for text in _texts(getattr(client, "kwargs", {})):
             if re.search(r"[/\\:]", text):
-                raise ValueError(
+                raise RefusedError(
                     f"client {client.client} of {folder} has the keyword argument {text!r}, which may name a file or a "
                     "module; register an environment of your own that says it itself (--gym-packages)"
                 )

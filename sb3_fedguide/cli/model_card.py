@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from fed_envs import FAMILIES, Family, load_family
 from sb3_fedguide.cli.hub import CURVE
 from sb3_fedguide.cli.run_folder import DEPLOYED, PARAMETERS
 from sb3_fedguide.common.digits import decimals
@@ -22,19 +23,20 @@ NAMED = ("sb3-fedguide", "stable-baselines3", "torch", "gymnasium", "mujoco")
 POLICIES = {"deployed": "as they left local training", "broadcast": "as the server sent them last"}
 
 
-def write_card(folder: Path, repository: str, run: Mapping[str, Any], packages: Sequence[str] = ()) -> str:
+def write_card(folder: Path, repository: str, run: Mapping[str, Any], family: Family, packages: Sequence[str] = ()) -> str:
     """The text of a run's ``README.md``.
 
     :param folder: with the files that go to the hub
     :param repository: ``OWNER/NAME``
     :param run: its ``summary.json``
+    :param family: its clients
     :param packages: modules that have to be imported first
     :raises ValueError: where the summary is damaged
     """
     try:
         returns = {policy: np.array(run[policy]["client_returns"], dtype=float) for policy in POLICIES if policy in run}
         front = yaml.safe_dump(_front_matter(run, returns), sort_keys=False, allow_unicode=True)
-        return f"---\n{front}---\n\n{_body(folder, repository, run, returns, packages)}"
+        return f"---\n{front}---\n\n{_body(folder, repository, run, family, returns, packages)}"
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise ValueError(f"summary.json is not the summary of a run: {error!r}") from None
 
@@ -76,10 +78,17 @@ def _front_matter(run: Mapping[str, Any], returns: Mapping[str, np.ndarray]) -> 
 
 
 def _body(
-    folder: Path, repository: str, run: Mapping[str, Any], returns: Mapping[str, np.ndarray], packages: Sequence[str]
+    folder: Path,
+    repository: str,
+    run: Mapping[str, Any],
+    family: Family,
+    returns: Mapping[str, np.ndarray],
+    packages: Sequence[str],
 ) -> str:
     algo, env = str(run["algo"]), str(run["env"])
     there, modules = f"logs/{algo}/{env}_1", f" --gym-packages {' '.join(packages)}" if packages else ""
+    known = env in FAMILIES and load_family(env).content_hash == family.content_hash
+    clients = f"--env {env}" if known else f"--metadata {there}/metadata.json"
     lines = [
         f"# {algo} on {env}",
         "",
@@ -91,14 +100,16 @@ def _body(
         "## Use",
         "",
         "```",
-        "pip install 'sb3-fedguide[hub]'",
+        "pip install 'sb3-fedguide[hub,onnx]'",
         f"fedguide pull {repository}{modules}    # says where the run is: {there}, or the next free number",
         f"fedguide evaluate {there}{modules}",
         f"fedguide export {there} --format sb3 onnx",
+        f"fedguide train -i {there} --algo {algo} {clients}{modules}",
         "```",
         "",
         "`fedguide export` makes ordinary policies, one of each client, which need this package no more.",
-        f"`fedguide train -i {there}` starts a new run from this one, with the network of `config.yml`.",
+        "`fedguide train` starts a new run from this one, whose network has to be that of `config.yml` "
+        "(`-params policy_kwargs.net_arch:[...]`).",
         "",
         "## Files",
         "",

@@ -10,7 +10,7 @@ from sb3_fedguide.benchmark.figures.rollouts import Cell, Row, draw_rollouts, pi
 from sb3_fedguide.benchmark.figures.runs import Comparison, Runs
 from sb3_fedguide.benchmark.figures.styles import style
 from sb3_fedguide.benchmark.plans import read_plans
-from sb3_fedguide.benchmark.rollouts import overlay, pictures, pose_steps, record
+from sb3_fedguide.benchmark.rollouts import overlay, pose_steps, poses, record
 from sb3_fedguide.cli.rendering import check_rendering
 from sb3_fedguide.cli.run_folder import PLAN
 from sb3_fedguide.cli.saved_run import in_place, load_model, read_deployed_policies, read_run
@@ -43,7 +43,7 @@ def rollouts(runs: Runs, clients: Sequence[int] | None = None) -> Figure:
         model = load_model(best.source, config, family)
         chosen = _clients(model, clients, family)
         with in_place(model, read_deployed_policies(best.source, model)):
-            cells = [_cell(model, family, client) for client in chosen]
+            cells = _cells(model, family, chosen)
         seed = f"seed {best.seed}, best of {len(group)}" if len(group) > 1 else f"seed {best.seed}"
         note = f"\n({seed}, {summary['rounds_done']} rounds)"
         rows.append(Row(name, style(best.method, best.variant), cells, note))
@@ -57,16 +57,19 @@ def _clients(model: Federation, asked: Sequence[int] | None, family: Family) -> 
     return list(asked or model.client_ids)
 
 
-def _cell(model: Federation, family: Family, client: int) -> Cell:
-    episode = record(family, client, model.client(client))
+def _cells(model: Federation, family: Family, clients: Sequence[int]) -> list[Cell]:
+    episodes = [record(family, client, model.client(client)) for client in clients]
     if family.world == "point_maze":
-        return Cell(episode)
+        return [Cell(episode) for episode in episodes]
     if family.world == "bandit2d":
         from sb3_fedguide.benchmark.bandit2d import Policies, policies
 
-        found, place = policies(model), model.client_ids.index(client)  # type: ignore[arg-type]
-        return Cell(episode, policy=Policies(found.mean[place : place + 1], found.std[place : place + 1]))
-    return Cell(episode, overlay(pictures(family, episode, pose_steps(episode), pixels(family))))
+        found = policies(model)  # type: ignore[arg-type]
+        places = [[model.client_ids.index(client)] for client in clients]
+        own = [Policies(found.mean[place], found.std[place]) for place in places]
+        return [Cell(episode, policy=policy) for episode, policy in zip(episodes, own, strict=True)]
+    size = pixels(family)
+    return [Cell(episode, overlay(poses(family, episode, pose_steps(episode), size))) for episode in episodes]
 
 
 def plans(comparison: Comparison, file_name: Callable[[str], str], notes: list[str]) -> list[tuple[str, Figure]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_fedguide.cli.arguments import OneLineParser
-from sb3_fedguide.cli.hub import FILES, NEEDED, check_repository, check_run, hub_api, hub_errors
+from sb3_fedguide.cli.hub import FILES, NEEDED, check_repository, check_run, hub_answers, hub_api, hub_errors
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -88,9 +88,10 @@ def _fetch(api: HfApi, repository: str, revision: str | None, folder: Path) -> N
 
     :raises ValueError: where one is missing, or larger than it may be
     """
-    commit = api.model_info(repository, revision=revision, expand=["sha"]).sha
-    found = {file.path: file.size for file in api.get_paths_info(repository, list(FILES), revision=commit)
-             if hasattr(file, "size")}  # fmt: skip
+    with hub_answers(api):
+        commit = api.model_info(repository, revision=revision, expand=["sha"]).sha
+        found = {file.path: int(file.size) for file in api.get_paths_info(repository, list(FILES), revision=commit)
+                 if hasattr(file, "size")}  # fmt: skip
     if missing := [name for name in NEEDED if name not in found]:
         raise ValueError(f"{repository} is no run that 'fedguide push' sent: it has no {missing[0]}")
     for name, bound in FILES.items():  # whatever else the answer names is left alone

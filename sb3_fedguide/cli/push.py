@@ -9,11 +9,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.cli.arguments import OneLineParser
-from sb3_fedguide.cli.hub import CARD, CURVE, FILES, LOGIN, check_repository, check_run, hub_api, hub_errors
+from sb3_fedguide.cli.hub import (
+    CARD,
+    CURVE,
+    FILES,
+    LOGIN,
+    RefusedError,
+    check_repository,
+    check_run,
+    hub_answers,
+    hub_api,
+    hub_errors,
+)
 from sb3_fedguide.cli.run_folder import EVALUATIONS, write_text, write_yaml
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
+
+    from fed_envs import Family
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "fedguide push") -> int:
@@ -58,7 +71,8 @@ def push_to_hub(
     :param message: of the commit
     :param packages: modules to import first, which register its algorithm or environments
     :return: the address of the repository
-    :raises ValueError: for a folder of something else, and where the hub refuses or does not answer
+    :raises ValueError: for a folder of something else, for what 'fedguide pull' would refuse, and where the hub refuses or
+        does not answer
     """
     check_repository(repository)
     if message is not None and not message.strip():
@@ -68,16 +82,25 @@ def push_to_hub(
 
     if get_token() is None:
         raise ValueError(f"there is no token for the hub: {LOGIN}")
-    run, config, _ = check_run(Path(folder), packages)
+    try:
+        run, config, family = check_run(Path(folder), packages)
+    except RefusedError as error:
+        raise ValueError(f"nothing is sent, since 'fedguide pull' would refuse the run: {error}") from None
     with tempfile.TemporaryDirectory() as part:
-        _collect(Path(folder), Path(part), repository, run, config.values, packages)
+        _collect(Path(folder), Path(part), repository, run, config.values, family, packages)
         with hub_errors(api, repository):
             return _send(api, repository, Path(part), private, message or f"{run['algo']} on {run['env']}, "
                          f"{run['rounds_done']} rounds")  # fmt: skip
 
 
 def _collect(
-    folder: Path, part: Path, repository: str, run: Mapping[str, Any], values: Mapping[str, Any], packages: Sequence[str]
+    folder: Path,
+    part: Path,
+    repository: str,
+    run: Mapping[str, Any],
+    values: Mapping[str, Any],
+    family: Family,
+    packages: Sequence[str],
 ) -> None:
     """Exactly the files that are to be sent, in a folder of their own.
 
@@ -91,7 +114,7 @@ def _collect(
     write_yaml(part / "config.yml", _without_paths(values))
     if "deployed" in run and (part / EVALUATIONS).is_file():
         draw_curve(folder, part / CURVE)
-    write_text(part / CARD, write_card(part, repository, run, packages))
+    write_text(part / CARD, write_card(part, repository, run, family, packages))
     for path in part.iterdir():
         if path.stat().st_size > FILES[path.name]:
             raise ValueError(f"{path.name} has {path.stat().st_size} bytes; 'fedguide pull' takes {FILES[path.name]}")
@@ -109,17 +132,17 @@ def _send(api: HfApi, repository: str, folder: Path, private: bool, message: str
     """One commit with the run's files; those of an earlier run that this one has not are removed."""
     from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
-    url = api.create_repo(repository, private=private or None, exist_ok=True)
-    if private and not api.model_info(repository, expand=["private"]).private:
+    with hub_answers(api):
+        url = api.create_repo(repository, private=private or None, exist_ok=True)
+        hidden = private and api.model_info(repository, expand=["private"]).private
+        there = {file.path for file in api.get_paths_info(repository, list(FILES))}
+    if private and not hidden:
         raise ValueError(f"{repository} is there already and not private; make it so on {url}, or leave --private out")
     sent = sorted(path.name for path in folder.iterdir())
-    there = {file.path for file in api.get_paths_info(repository, list(FILES))}
-    api.create_commit(
-        repository,
-        [
-            *(CommitOperationAdd(name, folder / name) for name in sent),
-            *(CommitOperationDelete(name) for name in sorted(there & FILES.keys() - set(sent))),
-        ],
-        commit_message=message,
-    )
+    changes: list[CommitOperationAdd | CommitOperationDelete] = [
+        *(CommitOperationAdd(name, folder / name) for name in sent),
+        *(CommitOperationDelete(name) for name in sorted(there & FILES.keys() - set(sent))),
+    ]
+    with hub_answers(api):
+        api.create_commit(repository, changes, commit_message=message)
     return str(url)

@@ -14,7 +14,7 @@ REMEDY = "set MUJOCO_GL=osmesa (Debian: libosmesa6) or MUJOCO_GL=egl"
 
 def check_rendering(family: Family, flag: str) -> None:
     """:raises ValueError: where nothing can be drawn; ``flag`` is what asks for it"""
-    env = family.make(0 if family.n_clients == 0 else family.clients[0].client)
+    env = family.make(family.clients[0].client)
     modes = env.metadata.get("render_modes", [])
     env.close()
     if "rgb_array" not in modes:

@@ -1,20 +1,24 @@
-"""Videos of clients' episodes: GIF by Pillow, or MP4 by Gymnasium's own writer."""
+"""Videos of clients' episodes: GIF by Pillow, or MP4 by moviepy, each frame written as it is drawn."""
 
 from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_fedguide.benchmark.rollouts import pictures, record
+from sb3_fedguide.benchmark.rollouts import evenly, pictures, record
+from sb3_fedguide.common.digits import shown
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
     from fed_envs import Family
+    from sb3_fedguide.benchmark.rollouts import Episode
     from sb3_fedguide.common.federation import Federation
 
 FORMATS = ("gif", "mp4")
@@ -34,11 +38,12 @@ def check_format(suffix: str) -> None:
 
 
 def write_videos(
-    folder: Path, policy: str, algo: str, family: Family, model: Federation, suffix: str = "gif", seed: int = 0
+    folder: Path, policy: str, algo: str, family: Family, model: Federation, seed: int, suffix: str = "gif"
 ) -> list[Path]:
-    """One episode of each client with the model's current policies, client and return written into the picture.
+    """One deterministic episode of each client with the model's current policies; client and return stand in the picture.
 
     :param policy: which of the run's policies these are; part of the files' names
+    :param seed: of the episodes' starts
     :return: the files
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -46,28 +51,29 @@ def write_videos(
     for client in model.client_ids:
         path = folder / f"{family.name}-client{client}-{policy}.{suffix}"
         episode = record(family, client, model.client(client), seed)
-        steps = _steps(len(episode), family, MAX_FRAMES if suffix == "gif" else None)
-        found = pictures(family, episode, steps, seed=seed)
-        heading = f"{family.name}, client {client}, {algo}: episode return {episode.episode_return:.2f}"
-        lines = [f"step {step} of {len(episode)}, return so far {episode.rewards[:step].sum():.2f}" for step in steps]
-        captioned = [caption(frame, heading, line) for frame, line in zip(found.frames, lines, strict=True)]
-        (_write_gif if suffix == "gif" else _write_mp4)(
-            path, captioned, found.rate / (steps[1] - steps[0] if len(steps) > 1 else 1)
-        )
+        steps = frame_steps(len(episode), episode.rate, MAX_FRAMES if suffix == "gif" else None)
+        heading = f"{family.name}, client {client}, {algo}: episode return {shown(episode.episode_return)}"
+        frames = _captioned(family, episode, steps, heading)
+        (_write_gif if suffix == "gif" else _write_mp4)(path, frames, [step / episode.rate for step in steps])
         written.append(path)
     return written
 
 
-def _steps(length: int, family: Family, most: int | None) -> list[int]:
-    """Steps after which there is a frame: evenly spaced, and the last.
+def frame_steps(length: int, rate: float, most: int | None) -> list[int]:
+    """Steps after which there is a frame: evenly spaced, with the start and the last.
 
+    :param rate: steps per second
     :param most: of them; ``None`` for no limit
     """
-    env = family.make(family.clients[0].client)
-    rate = float(env.metadata.get("render_fps", 30))
-    env.close()
-    every = max(math.ceil(rate / FASTEST), math.ceil(length / most) if most else 1)
-    return sorted({*range(0, length + 1, every), length})
+    n_frames = length // math.ceil(rate / FASTEST) + 1
+    return evenly(length, max(2, n_frames if most is None else min(n_frames, most)))
+
+
+def _captioned(family: Family, episode: Episode, steps: Sequence[int], heading: str) -> Iterator[Image]:
+    for step, frame in zip(steps, pictures(family, episode, steps), strict=True):
+        yield caption(
+            frame, heading, f"step {step} of {len(episode)}, return so far {shown(float(episode.rewards[:step].sum()))}"
+        )
 
 
 def caption(frame: np.ndarray, heading: str, line: str) -> Image:
@@ -87,20 +93,32 @@ def caption(frame: np.ndarray, heading: str, line: str) -> Image:
     return canvas
 
 
-def _write_gif(path: Path, frames: list[Image], rate: float) -> None:
+def _write_gif(path: Path, frames: Iterator[Image], times: Sequence[float]) -> None:
+    """:param times: of the frames, in seconds"""
     from PIL import Image
 
     from fed_envs.files import atomic_file
 
     first, *others = (frame.quantize(_COLORS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE) for frame in frames)
-    durations = [round(1000 / rate)] * len(others) + [1000]  # ms; the end can be read
+    # A GIF's delays are whole hundredths of a second; rounded times, not rounded delays, keep its speed.
+    durations = [*(10 * np.diff(np.round(100 * np.array(times)))).astype(int).tolist(), 1000]  # ms; the end can be read
     with atomic_file(path, "wb") as file:
         first.save(file, format="GIF", save_all=True, append_images=others, duration=durations, loop=0)
 
 
-def _write_mp4(path: Path, frames: list[Image], rate: float) -> None:
-    from gymnasium.utils.save_video import save_video
+def _write_mp4(path: Path, frames: Iterator[Image], times: Sequence[float]) -> None:
+    """:param times: of the frames, in seconds, evenly spaced"""
+    from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter  # Gymnasium's save_video wants all frames at once
 
-    pictures = [np.asarray(frame) for frame in frames]
-    save_video(pictures, str(path.parent), episode_trigger=lambda _: True, name_prefix=path.stem, fps=rate, save_logger=None)
-    (path.parent / f"{path.stem}-episode-0.mp4").replace(path)
+    part = path.with_name(f".{path.stem}.part.mp4")
+    first = next(frames)
+    try:
+        writer = FFMPEG_VideoWriter(str(part), first.size, (len(times) - 1) / (times[-1] - times[0]))
+        try:
+            for frame in chain([first], frames):
+                writer.write_frame(np.asarray(frame))
+        finally:
+            writer.close()
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -13,6 +13,7 @@ from matplotlib.patches import Rectangle
 from sb3_fedguide.benchmark.figures.layout import MEDIUM, SMALL, legend, panels
 from sb3_fedguide.benchmark.figures.runs import Runs, finished, seeds
 from sb3_fedguide.benchmark.results import STUCK, Result
+from sb3_fedguide.common.digits import shown
 
 _STUCK_COLOR = "#D55E00"
 
@@ -91,7 +92,7 @@ def draw_clients(family: str, runs: Runs) -> Figure:
     figure, (axes,) = panels(1, (1.9 + 0.62 * n_clients, max(2.4, 1.1 + 0.42 * n_methods)), beside=2.1)
     image = axes.imshow(np.clip(found.share, 0.0, 1.0), cmap="cividis", vmin=0.0, vmax=1.0, aspect="auto")
     for (row, column), share in np.ndenumerate(found.share):
-        text = _short(float(found.mean[row, column]))
+        text = shown(float(found.mean[row, column]))
         if found.stuck[row, column]:
             text += f"\n{found.stuck[row, column]} of {found.n_seeds[row]}"
         axes.text(column, row, text, ha="center", va="center", fontsize=6.5, color="black" if share > 0.6 else "white")
@@ -102,7 +103,7 @@ def draw_clients(family: str, runs: Runs) -> Figure:
     labels = [f"{name} ({seeds(n)})" for name, n in zip(found.names, found.n_seeds, strict=True)]
     axes.set_yticks(range(n_methods), labels, fontsize=SMALL)
     axes.set_xticks(
-        range(n_clients), [f"{client}\n{_short(best)}" for client, best in zip(found.clients, found.best, strict=True)]
+        range(n_clients), [f"{client}\n{shown(best)}" for client, best in zip(found.clients, found.best, strict=True)]
     )
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
@@ -117,7 +118,3 @@ def draw_clients(family: str, runs: Runs) -> Figure:
     note = "\n\nwhere the best is negative:\nshort of it by 40 % of its size" if (found.best < 0).any() else ""
     legend(figure, box, f"k of n: stuck with k\nof n seeds{note}")
     return figure
-
-
-def _short(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

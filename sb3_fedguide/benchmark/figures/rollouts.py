@@ -23,6 +23,7 @@ from sb3_fedguide.benchmark.figures.layout import MEDIUM, SMALL, legend, panels
 from sb3_fedguide.benchmark.figures.mazes import draw_maze
 from sb3_fedguide.benchmark.figures.styles import Style
 from sb3_fedguide.benchmark.rollouts import GROUND, Episode
+from sb3_fedguide.common.digits import shown
 
 #: Width and height of a cell, inches: of walking bodies, and of all other worlds.
 WIDE, SQUARE = (1.75, 0.95), (1.0, 1.0)
@@ -100,7 +101,7 @@ def draw_rollouts(family: Family, rows: Sequence[Row]) -> Figure:
 
 
 def _title(episode: Episode) -> str:
-    text = f"client {episode.client}: {_short(episode.episode_return)}"
+    text = f"client {episode.client}: {shown(episode.episode_return)}"
     if len(episode.positions) and episode.seconds:
         way = episode.positions[-1] - episode.positions[0]
         text += f"; {way:.1f} m in {len(episode) * episode.seconds:.1f} s"
@@ -164,7 +165,3 @@ def _explanation(family: Family) -> str:
     if family.world == "locomotion":
         return f"poses at even times on the\nfirst {GROUND:g} m, the last one\nopaque; way and time of\nthe whole episode"
     return "poses at even times,\nthe last one opaque"
-
-
-def _short(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2f}" if abs(value) < 10 else f"{value:.1f}"
