@@ -16,7 +16,8 @@ class Entry(NamedTuple):
 
     :param module: where its class is
     :param cls: the class's name
-    :param server: ``"module:name"`` of its server's :class:`~sb3_fedguide.server.build.Method`; ``None`` for its base class's
+    :param server: ``"module:name"`` of its server's :class:`~sb3_fedguide.server.methods.Method`; ``None`` for that of its
+        base class
     :param settings: its YAML file; ``None`` for ``<name>.yml`` in ``zoo_configs``, or else that of the nearest base class
     """
 
@@ -27,7 +28,7 @@ class Entry(NamedTuple):
 
 
 def _ours(module: str, cls: str, server: str) -> Entry:
-    return Entry(f"sb3_fedguide.algorithms.{module}", cls, f"sb3_fedguide.server.build:{server}")
+    return Entry(f"sb3_fedguide.algorithms.{module}", cls, f"sb3_fedguide.server.methods:{server}")
 
 
 #: by command-line name
@@ -51,7 +52,7 @@ def register_algorithm(name: str, entry_point: str, server: str | None = None, s
 
     :param name: what ``--algo`` takes
     :param entry_point: ``"module:Class"``, imported when it is first used
-    :param server: ``"module:name"`` of its :class:`~sb3_fedguide.server.build.Method`, which a server imports and may do
+    :param server: ``"module:name"`` of its :class:`~sb3_fedguide.server.methods.Method`, which a server imports and may do
         without PyTorch; without it, the nearest base class's
     :param settings: YAML file with its hyperparameters; without it, those of the nearest base class
     :raises ValueError: for a name that means something else already

@@ -13,7 +13,7 @@ import numpy as np
 import sb3_fedguide
 from sb3_fedguide.deployment.serve import ServerConfig, serve
 from sb3_fedguide.deployment.transport import Failure, Message
-from sb3_fedguide.server.build import complete_settings
+from sb3_fedguide.server.methods import complete_settings
 from sb3_fedguide.server.metrics import ClientEvaluation
 
 NAME = "action_net.weight"

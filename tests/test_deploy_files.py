@@ -94,7 +94,7 @@ def test_docker_compose_takes_the_file() -> None:
 
 @pytest.mark.flower
 def test_the_containers_configurations_are_sound(certificates: Path, keys: Path, tmp_path: Path) -> None:
-    from sb3_fedguide.deployment.files import ClientDeployment, ServerDeployment
+    from sb3_fedguide.deployment.config_files import ClientDeployment, ServerDeployment
 
     shutil.copytree(COMPOSE, tmp_path / "compose")
     server, sites = tmp_path / "compose" / "server", [tmp_path / "compose" / f"site_{k}" for k in (0, 1)]

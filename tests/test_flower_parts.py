@@ -87,7 +87,7 @@ def test_wrong_configurations_are_refused_in_one_line(keys: Path, kind: str, cha
 def test_the_server_takes_what_concerns_it_from_the_clients_settings(keys: Path) -> None:
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
-    from sb3_fedguide.deployment.files import ROLLOUT_SIZE, ServerDeployment
+    from sb3_fedguide.deployment.config_files import ROLLOUT_SIZE, ServerDeployment
     from sb3_fedguide.settings.schema import hyperparameters
 
     path = keys / "server.yml"
@@ -101,7 +101,7 @@ def test_the_server_takes_what_concerns_it_from_the_clients_settings(keys: Path)
 def test_settings_are_where_the_file_says_whatever_the_working_directory_is(
     keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sb3_fedguide.deployment.files import ClientDeployment, ServerDeployment
+    from sb3_fedguide.deployment.config_files import ClientDeployment, ServerDeployment
 
     (keys / "own.yml").write_text(yaml.safe_dump({"default": {"n_rounds": 7}}))
     monkeypatch.chdir(tmp_path)
@@ -302,7 +302,7 @@ def test_flower_is_told_to_be_silent() -> None:
 
 def test_the_server_needs_neither_pytorch_nor_a_simulator() -> None:
     code = (
-        "import sys; from sb3_fedguide.deployment import files; "
+        "import sys; from sb3_fedguide.deployment import config_files; "
         "from sb3_fedguide.deployment.flower import server_app, server_node; "
         "print(*{'torch', 'mujoco', 'stable_baselines3'} & sys.modules.keys())"
     )
@@ -360,7 +360,7 @@ def test_the_journal_has_the_lines_of_this_package_and_of_others_what_is_wrong(
 
 
 def test_the_example_on_one_machine_is_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sb3_fedguide.deployment.files import ClientDeployment, ServerDeployment
+    from sb3_fedguide.deployment.config_files import ClientDeployment, ServerDeployment
     from sb3_fedguide.deployment.site_config import read_site_config
 
     text = (Path(__file__).parent.parent / "docs" / "deployment.md").read_text()

@@ -9,9 +9,9 @@ import pytest
 
 from sb3_fedguide import FedAvg, FedGuideA, registry
 from sb3_fedguide.registry import ALGORITHMS, algorithm, register_algorithm
-from sb3_fedguide.server import build
+from sb3_fedguide.server import methods
 from sb3_fedguide.server.averaging import Averaging
-from sb3_fedguide.server.build import Method, complete_settings, find_method, make_strategy, method_of
+from sb3_fedguide.server.methods import Method, complete_settings, find_method, make_strategy, method_of
 from sb3_fedguide.server.ot_moe import OTMoE
 from sb3_fedguide.server.participants import draw_participants
 from sb3_fedguide.server.rounds import Coordinator, participants
@@ -122,7 +122,7 @@ OWN_METHOD = Method(double, {"k": 1})
 
 def test_algorithms_of_ones_own(monkeypatch):
     monkeypatch.setattr(registry, "ALGORITHMS", known := dict(ALGORITHMS))
-    monkeypatch.setattr(build, "ALGORITHMS", known)
+    monkeypatch.setattr(methods, "ALGORITHMS", known)
     register_algorithm("half", f"{__name__}:Half")
     register_algorithm("own", f"{__name__}:Own")
     assert make_strategy("half", {"average_every": 3}, 3, 0).average_every == 3  # its base class's server

@@ -13,7 +13,7 @@ import sb3_fedguide
 from sb3_fedguide.deployment.serve import Server, TooFewClients
 from sb3_fedguide.deployment.transport import Failure, Message
 from sb3_fedguide.server.averaging import combine
-from sb3_fedguide.server.build import complete_settings
+from sb3_fedguide.server.methods import complete_settings
 from sb3_fedguide.server.metrics import ClientEvaluation, count_tests
 from sb3_fedguide.state.checkpoint_files import checkpoints
 from tests.loop_transport import CONFIG, NAME, STATED, Client, LoopTransport, replaced, run, timeout, upload

@@ -121,7 +121,7 @@ class Finder(importlib.machinery.PathFinder):  # as if they were not installed
 
 sys.meta_path[:] = [Finder if finder is importlib.machinery.PathFinder else finder for finder in sys.meta_path]
 from sb3_fedguide.registry import ALGORITHMS
-from sb3_fedguide.server.build import complete_settings, make_strategy
+from sb3_fedguide.server.methods import complete_settings, make_strategy
 for name in ALGORITHMS:
     make_strategy(name, {}, 3, 0)
 import numpy as np

@@ -19,7 +19,7 @@ from sb3_fedguide.cli.signals import StopSignals
 from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 
 if TYPE_CHECKING:
-    from sb3_fedguide.deployment.files import ClientDeployment
+    from sb3_fedguide.deployment.config_files import ClientDeployment
 
 #: In a deployment's folder, what its processes are told.
 CONFIG = "config.json"
@@ -104,7 +104,7 @@ def _key(arguments: argparse.Namespace) -> int:
 
 
 def _server(arguments: argparse.Namespace) -> int:
-    from sb3_fedguide.deployment.files import ServerDeployment
+    from sb3_fedguide.deployment.config_files import ServerDeployment
     from sb3_fedguide.deployment.flower.server_node import ServerNode
 
     deployment = ServerDeployment(arguments.config)
@@ -118,7 +118,7 @@ def _server(arguments: argparse.Namespace) -> int:
 
 
 def _client(arguments: argparse.Namespace) -> int:
-    from sb3_fedguide.deployment.files import ClientDeployment
+    from sb3_fedguide.deployment.config_files import ClientDeployment
     from sb3_fedguide.deployment.flower.client_node import ClientNode
     from sb3_fedguide.deployment.site_config import read_site_config
 

@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_fedguide.common.normalization import FederatedNormalizer
-from sb3_fedguide.server.build import COMMON, Method, complete_settings, make_strategy, method_of
+from sb3_fedguide.server.methods import COMMON, Method, complete_settings, make_strategy, method_of
 from sb3_fedguide.server.payload import OBSERVATIONS
 from sb3_fedguide.server.strategy import Payload, Strategy
 

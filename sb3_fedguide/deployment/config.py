@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from sb3_fedguide.server.build import complete_settings
+from sb3_fedguide.server.methods import complete_settings
 from sb3_fedguide.settings.participants import n_participants
 
 #: In which a run without limits ends.
@@ -27,7 +27,7 @@ class ServerConfig:
     :param n_rounds: rounds of the run
     :param rollout_size: environment steps of a client in a round
     :param seed: the federation's
-    :param settings: the method's hyperparameters on the server, see :mod:`sb3_fedguide.server.build`; those that are
+    :param settings: the method's hyperparameters on the server, see :mod:`sb3_fedguide.server.methods`; those that are
         not given have the constructors' defaults
     :param timeout: seconds that a client may take for a round; ``None`` for no limit
     :param setup_timeout: the same of everything before the first round, where behaviour cloning, priors and DICE are trained

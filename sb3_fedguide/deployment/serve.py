@@ -17,7 +17,7 @@ from fed_envs.plain_data import State, freeze, thaw
 from sb3_fedguide.deployment.clients import RUN_FACTS, Clients, difference, server_facts
 from sb3_fedguide.deployment.config import ServerConfig, TooFewClients
 from sb3_fedguide.deployment.transport import RUN, UNPREPARED, Failure, Kind, Message, Transport
-from sb3_fedguide.server.build import make_strategy
+from sb3_fedguide.server.methods import make_strategy
 from sb3_fedguide.server.metrics import EVALUATION_COLUMNS, count_tests, evaluation_metrics, merge_metrics, read_evaluations
 from sb3_fedguide.server.payload import Payload
 from sb3_fedguide.server.rounds import Coordinator, participants, payload_bytes, rejections

@@ -13,7 +13,7 @@ import pydantic
 from sb3_fedguide.deployment.config import ServerConfig
 from sb3_fedguide.deployment.flower.certificates import CA, SERVER, SERVER_KEY, read_public_key
 from sb3_fedguide.registry import ALGORITHMS
-from sb3_fedguide.server.build import COMMON, find_method, make_strategy
+from sb3_fedguide.server.methods import COMMON, find_method, make_strategy
 from sb3_fedguide.settings.config import CONFIGURATIONS, DEFAULT, config_path, read_config, read_yaml
 from sb3_fedguide.settings.names import check_names
 

@@ -100,7 +100,7 @@ def _load(server: str) -> Method:
     module, _, name = server.partition(":")
     method = getattr(import_module(module), name, None)
     if not isinstance(method, Method):
-        raise ValueError(f"server={server!r} of an algorithm must name a sb3_fedguide.server.build.Method, not {method!r}")
+        raise ValueError(f"server={server!r} of an algorithm must name a sb3_fedguide.server.methods.Method, not {method!r}")
     return method
 
 
