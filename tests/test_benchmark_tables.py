@@ -198,3 +198,14 @@ def test_the_committed_studies_and_results_give_the_documented_list(monkeypatch)
     compare = importlib.import_module("compare")
     text = compare.LIST.read_text(encoding="utf-8")
     assert compare.with_studies(text) == text
+
+
+def test_the_list_of_studies_counts_the_evaluations_that_each_asks_for(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    compare = importlib.import_module("compare")
+    monkeypatch.setattr(compare, "STUDIES", tmp_path)
+    for name, settings in {"few": "eval_episodes: 1", "many": "eval_episodes: 1000", "often": "eval_freq: 1"}.items():
+        text = f"{{methods: {{local: }}, families: [HopperHard], seeds: [0], rounds: 300, folder: results, {settings}}}"
+        (tmp_path / f"{name}.yml").write_text(text)
+    hours = [int(line.split("|")[-2]) for line in compare.studies().splitlines()[2:]]
+    assert hours[0] < hours[2] < hours[1]

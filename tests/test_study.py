@@ -24,6 +24,7 @@ from sb3_fedguide.cli.benchmark_tables import Tables, latex, rows_of
 from sb3_fedguide.cli.delays import read_delays
 from sb3_fedguide.cli.plot import FIGURES
 from sb3_fedguide.cli.study_file import read_study
+from sb3_fedguide.cli.train import main as train
 from sb3_fedguide.settings import evaluation
 from sb3_fedguide.settings.config import resolve
 from tests.result_files import result, two_families
@@ -156,6 +157,25 @@ def test_results_are_read_once_for_tables_and_figures(flags, tmp_path, monkeypat
     before = 0 if flags else 2  # each is held against the settings that are asked for
     assert len(read) == before + 2
     assert (tmp_path / "results" / "studies" / "mine" / "bars.png").is_file()
+
+
+def test_a_study_with_averages_ends_with_figures_of_its_runs_logs(tmp_path, monkeypatch, capfd):
+    """The runs are real, but done in this process."""
+    monkeypatch.setattr(plot, "FIGURES", ())
+    monkeypatch.setattr(layout, "DPI", 20)
+    monkeypatch.setattr(layout, "FORMATS", ("png",))
+
+    def run_here(runs, n_processes, signals, report, say):
+        for run in runs:
+            assert train(run.flags) == 0
+            report(run, Outcome(benchmark_runs._content(run)))
+
+    monkeypatch.setattr(benchmark_runs, "run_here", run_here)
+    small = {"rollout_size": 16, "batch_size": 16, "n_epochs": 1, "n_envs_per_client": 2, "bc_weight": 0.0}
+    path = write(tmp_path, methods={"local": None}, params=small, seeds=[0], rounds=1, eval_average=True)
+    assert main(["--study", path]) == 0
+    assert (tmp_path / "results" / "studies" / "mine" / "theorem3.png").is_file()
+    assert "it has no V_phi" in capfd.readouterr().err  # why there is no lemma2
 
 
 def test_a_dry_run_lists_and_writes_nothing(tmp_path, capfd):

@@ -13,12 +13,11 @@ from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.settings.config import resolve
 from sb3_fedguide.settings.evaluation import EVAL_EPISODES, EVAL_FREQ
 from sb3_fedguide.settings.names import check_names
+from sb3_fedguide.settings.pretraining import Count
 from sb3_fedguide.settings.schema import check_model
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
-
-Count = Annotated[int, Field(ge=1)]
 
 
 class SiteConfig(BaseModel):
