@@ -2,9 +2,9 @@
 
     python benchmarks/compare.py page
 
-writes both pages anew: tables that stand under ``<!-- table: FAMILY LABEL -->``, those of a study's family under
-``<!-- study: NAME FAMILY -->``, and the list of studies under ``<!-- studies -->``. ``fedguide benchmark --study
-benchmarks/studies/NAME.yml`` does a study's runs.
+writes both pages anew: the first table under ``<!-- overview -->``, tables that stand under ``<!-- table: FAMILY LABEL
+-->``, those of a study's family under ``<!-- study: NAME FAMILY -->``, and the list of studies under ``<!-- studies -->``.
+``fedguide benchmark --study benchmarks/studies/NAME.yml`` does a study's runs.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+from sb3_fedguide.benchmark.results import Measures, best_known, measure, read_results
 from sb3_fedguide.cli.benchmark import prepare_benchmark
 from sb3_fedguide.cli.benchmark_arguments import parse_benchmark
 from sb3_fedguide.cli.benchmark_costs import total_hours
@@ -24,6 +25,12 @@ from sb3_fedguide.cli.study_file import read_study
 
 HERE = Path(__file__).resolve().parent
 RESULTS, STUDIES = HERE / "results", HERE / "studies"
+#: Families of the first table, and the labels of their results.
+OVERVIEW = {
+    "Hopper": "tuned", "HopperHard": "tuned", "Walker2D": "tuned", "Walker2DHard": "tuned", "HalfCheetah": "tuned",
+    "HalfCheetahHard": "tuned", "Reacher": "tuned", "ReacherHard": "tuned", "PointMazeHard": "20rounds",
+    "MetaWorld10": "tuned",
+}  # fmt: skip
 PAGE, LIST = HERE.parent / "docs" / "results.md", HERE.parent / "docs" / "reproduce.md"
 
 
@@ -44,10 +51,42 @@ def with_tables(text: str) -> str:
         r"table: (?P<family>\S+) (?P<label>\S+)", text,
         lambda match: _table("--envs", match["family"], "--label", match["label"], "-f", str(RESULTS)),
     )  # fmt: skip
+    text = _replaced("overview", text, lambda match: overview())
     return _replaced(
         r"study: (?P<name>\S+) (?P<family>\S+)", text,
         lambda match: _table("--study", str(STUDIES / f"{match['name']}.yml"), "--envs", match["family"]),
     )  # fmt: skip
+
+
+def overview() -> str:
+    """Local and FedGuide-R on every family that has results of both, as a Markdown table."""
+    lines = [
+        "| family | seeds: local, fedguide-r | F: local | fedguide-r | ratio | difference | worst client | stuck | speed-up |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for family, label in OVERVIEW.items():
+        found = read_results(RESULTS, family, label, ["local", "fedguide-r"])
+        if len(found) == 2:
+            local, ours = found["local"], found["fedguide-r"]
+            best = best_known([*local, *ours])
+            lines.append(_overview_row(family, measure(local, best_known=best), measure(ours, (), local, best)))
+    return "\n".join(lines)
+
+
+def _overview_row(family: str, local: Measures, ours: Measures) -> str:
+    def change(name: str) -> str:
+        before, after = getattr(local, name), getattr(ours, name)
+        return "-" if before is None or after is None else f"{before:.4g} → {after:.4g}"
+
+    interval = ours.difference_interval
+    spread = "" if interval is None else f" ({interval[0]:.3g} to {interval[1]:.3g})"
+    difference = "-" if ours.difference is None else f"{ours.difference:+.3g}{spread}"
+    cells = [
+        family, f"{len(local.seeds)}, {len(ours.seeds)}", f"{local.F:.4g}", f"{ours.F:.4g}",
+        f"{ours.F / local.F:.2f}" if local.F > 0 else "-", difference,
+        change("worst_client"), change("stuck"), "-" if ours.speed_up is None else f"{ours.speed_up:.2f}",
+    ]  # fmt: skip
+    return f"| {' | '.join(cells)} |"
 
 
 def with_studies(text: str) -> str:
