@@ -14,11 +14,9 @@ from sb3_fedguide.deployment.config import ServerConfig
 from sb3_fedguide.deployment.flower.certificates import CA, SERVER, SERVER_KEY, read_public_key
 from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.server.methods import COMMON, find_method, make_strategy
+from sb3_fedguide.settings.arguments import FederationArguments
 from sb3_fedguide.settings.config import CONFIGURATIONS, DEFAULT, config_path, read_config, read_yaml
 from sb3_fedguide.settings.names import check_names
-
-#: Default of every algorithm's constructor, which a server without PyTorch cannot ask.
-ROLLOUT_SIZE = 4096
 
 
 class _File(pydantic.BaseModel):
@@ -103,7 +101,7 @@ class ServerDeployment:
         settings = _settings(file, base)
         given = {name: settings[name] for name in (*COMMON, *find_method(file.algo).defaults) if name in settings}
         limits = {name: getattr(file, name) for name in ("timeout", "setup_timeout", "start_clients", "min_clients", "wait")}
-        rollout_size = settings.get("rollout_size", ROLLOUT_SIZE)
+        rollout_size = settings.get("rollout_size", FederationArguments.rollout_size)
         try:
             self.server = ServerConfig(
                 file.algo, len(self.clients), _rounds(file, settings), rollout_size, file.seed, given, **limits

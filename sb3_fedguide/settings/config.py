@@ -8,13 +8,15 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
 
 from sb3_fedguide.registry import ALGORITHMS, algorithm, registered_names
-from sb3_fedguide.settings import schema
+from sb3_fedguide.settings import networks, schema
+from sb3_fedguide.settings.arguments import Rounds
 from sb3_fedguide.settings.names import check_names, nearest
+from sb3_fedguide.settings.networks import NetworkConfig
 from sb3_fedguide.settings.participants import n_participants
 
 if TYPE_CHECKING:
@@ -88,7 +90,7 @@ class Config:
         :raises ValueError: where the values do not fit together
         """
         values = {name: schema.schedule_or_value(value) for name, value in self.values.items() if name != "n_rounds"}
-        network = algorithm(self.algo).network_config.model_validate(values.pop("policy_kwargs"))
+        network = network_config(self.algo).model_validate(values.pop("policy_kwargs"))
         policy = values.pop("policy")
         with warnings.catch_warnings():
             # SB3 compares a client's batch_size with the steps of all clients; FederatedPPO has checked it against its own.
@@ -161,18 +163,18 @@ def complete(given: Mapping[str, Any], algo: str) -> dict[str, Any]:
     """
     from sb3_fedguide.settings.pretraining import PretrainingConfig
 
-    parameters = schema.hyperparameters(algorithm(algo))
+    parameters = schema.hyperparameters_of(algo)
     _check_keys(given, algo, "the hyperparameters")
     if "n_rounds" not in given:
         raise ValueError("the number of rounds is missing; give n_rounds in the configuration, or --rounds")
     values: dict[str, Any] = {
         "policy": schema.check_value("policy", given.get("policy", "MlpPolicy"), _policy_type(algo)),
-        "n_rounds": schema.check_value("n_rounds", given["n_rounds"], int),
+        "n_rounds": schema.check_value("n_rounds", given["n_rounds"], Rounds),
     }
     for name, (hint, default) in parameters.items():
         if name not in NESTED:
             values[name] = schema.check_value(name, given[name], hint) if name in given else default
-    network = schema.check_model("policy_kwargs", algorithm(algo).network_config, given.get("policy_kwargs") or {}, {})
+    network = schema.check_model("policy_kwargs", network_config(algo), given.get("policy_kwargs") or {}, {})
     offline = schema.check_model("pretraining", PretrainingConfig, given.get("pretraining") or {}, _SET_ELSEWHERE)
     values["policy_kwargs"] = network.model_dump(mode="json")
     values["pretraining"] = offline.model_dump(mode="json", exclude=set(_SET_ELSEWHERE))
@@ -290,13 +292,16 @@ def parse_params(pairs: Sequence[str], flag: str = "-params") -> dict[str, Any]:
 
 
 def _policy_type(algo: str) -> Any:
-    from typing import Literal
+    return Literal[schema.declared_arguments(algo).policies]
 
-    return Literal[tuple(algorithm(algo).policy_aliases)]
+
+def network_config(algo: str) -> type[NetworkConfig]:
+    """What an algorithm's ``policy_kwargs`` are."""
+    return getattr(networks, schema.declared_arguments(algo).network_config)
 
 
 def _check_keys(values: Mapping[str, Any], algo: str, where: str) -> None:
-    known = {"policy", "n_rounds", *schema.hyperparameters(algorithm(algo))}
+    known = {"policy", "n_rounds", *schema.hyperparameters_of(algo)}
     for name in values:
         if not isinstance(name, str) or name not in known:
             raise ValueError(
