@@ -22,7 +22,8 @@ from sb3_fedguide import FedGuide, Local
 from sb3_fedguide.cli import recorder
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.main import main as fedguide
-from sb3_fedguide.cli.train import find_family, main, prepare
+from sb3_fedguide.cli.request import find_family, resolve_request
+from sb3_fedguide.cli.train import main, prepare
 from sb3_fedguide.common.evaluation import evaluate_federation, evaluation_env
 
 ROOT = Path(__file__).parents[1]
@@ -33,7 +34,7 @@ TINY_OFFLINE = ["-params", "pretraining.bc_updates:2", "pretraining.dice_updates
 
 def prepared(*argv: str):
     arguments = parse_train(argv, "train.py")
-    return prepare(arguments, find_family(arguments), "")
+    return prepare(resolve_request(arguments, find_family(arguments)), "")
 
 
 WRONG = {

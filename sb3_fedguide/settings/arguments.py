@@ -148,16 +148,18 @@ class AveragingArguments:
 
 @dataclass(frozen=True, kw_only=True)
 class FedAvgArguments(AveragingArguments, FederatedPPOArguments):
-    pass
+    """Those of :class:`~sb3_fedguide.algorithms.fedavg.FedAvg`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FedRLArguments(AveragingArguments, FederatedDDPGArguments):
-    pass
+    """Those of :class:`~sb3_fedguide.algorithms.fedrl.FedRL`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FedProxArguments(FedAvgArguments):
+    """Those of :class:`~sb3_fedguide.algorithms.fedprox.FedProx`."""
+
     mu: Annotated[float, Range(0, says="not be negative: it is the weight of the proximal term; 0 is FedAvg")] = 0.01
 
 
@@ -167,24 +169,32 @@ Divergence = Annotated[float, Range(0, says="not be negative: it weighs a diverg
 
 @dataclass(frozen=True, kw_only=True)
 class FedKLArguments(FedAvgArguments):
+    """Those of :class:`~sb3_fedguide.algorithms.fedkl.FedKL`."""
+
     lambda_global: Divergence = 0.1
     lambda_local: Divergence = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class FedSVRPGMArguments(FedAvgArguments):
+    """Those of :class:`~sb3_fedguide.algorithms.fedsvrpgm.FedSVRPGM`."""
+
     beta: Annotated[float, Range(0, 1, "lie in [0, 1]: it is the weight of the plain gradient; 1 is FedAvg")] = 0.2
     reference_every: AverageEvery = 5
 
 
 @dataclass(frozen=True, kw_only=True)
 class FedGuideRArguments(FedAvgArguments):
+    """Those of :class:`~sb3_fedguide.algorithms.fedguide_r.FedGuideR`."""
+
     server_step: ServerStep = 2.0
     screening: Tested = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class FedGuideArguments(FederatedPPOArguments):
+    """Those of :class:`~sb3_fedguide.algorithms.fedguide.FedGuide`."""
+
     lambda_trust: NotNegative = 0.05
     lambda_prior: NotNegative = 0.5
     prior_horizon: Count = 50
@@ -210,5 +220,7 @@ class FedGuideArguments(FederatedPPOArguments):
 
 @dataclass(frozen=True, kw_only=True)
 class FedGuideAArguments(AveragingArguments, FedGuideArguments):
+    """Those of :class:`~sb3_fedguide.algorithms.fedguide.FedGuideA`."""
+
     average: Average = "actor"
     average_every: AverageEvery = 5

@@ -122,12 +122,8 @@ def resolve(
     :raises ValueError: for anything unknown, of the wrong type or out of range
     """
     check_names([algo], ALGORITHMS, "algorithm")
-    path = config_path(conf_file, algo)
     names = (entry or family.name, BACKBONE_FAMILIES.get(family.backbone, ""))
-    applied, merged = _entries(path, names, algo)
-    if conf_file in OVERLAYS:
-        merged = _merge(merged, _entries(_config_folder() / OVERLAYS[conf_file], names, algo)[1])
-    merged = _merge(merged, _nest(overrides or {}))
+    path, applied, merged = layers(algo, conf_file, names, overrides or {})
     try:
         values = complete(merged, algo)
     except ValueError as error:
@@ -139,14 +135,32 @@ def resolve(
     return Config(algo, applied, values)
 
 
-def _entries(path: Path, names: Sequence[str], algo: str) -> tuple[str, dict[str, Any]]:
+def layers(
+    algo: str, conf_file: str, names: Sequence[str], overrides: Mapping[str, Any], check: bool = True
+) -> tuple[Path, str, dict[str, Any]]:
+    """What a configuration, what goes over it, and ``overrides`` say together; values are not yet checked.
+
+    :param names: of entries, of which the first that the configuration has applies
+    :param overrides: nested ones by dotted keys
+    :param check: refuse unknown hyperparameters in files, and name the file
+    :return: the file, the entry that applied beyond ``default``, and the values
+    """
+    path = config_path(conf_file, algo)
+    applied, merged = _entries(path, names, algo, check)
+    if conf_file in OVERLAYS:
+        merged = _merge(merged, _entries(_config_folder() / OVERLAYS[conf_file], names, algo, check)[1])
+    return path, applied, _merge(merged, _nest(overrides))
+
+
+def _entries(path: Path, names: Sequence[str], algo: str, check: bool) -> tuple[str, dict[str, Any]]:
     """The first of the entries ``names`` that a file has, and what it says over the file's ``default``."""
     content = read_config(path)
     applied = next((name for name in names if name in content), DEFAULT)
     merged: dict[str, Any] = {}
     for name in dict.fromkeys((DEFAULT, applied)):
         if name in content:
-            _check_keys(content[name], algo, f"{path}, entry {name!r}")
+            if check:
+                _check_keys(content[name], algo, f"{path}, entry {name!r}")
             merged = _merge(merged, content[name])
     return applied, merged
 
@@ -292,7 +306,7 @@ def parse_params(pairs: Sequence[str], flag: str = "-params") -> dict[str, Any]:
 
 
 def _policy_type(algo: str) -> Any:
-    return Literal[schema.declared_arguments(algo).policies]
+    return Literal[schema.policies(algo)]
 
 
 def network_config(algo: str) -> type[NetworkConfig]:

@@ -36,10 +36,6 @@ class Range(NamedTuple):
         high = "∞)" if self.high == math.inf else f"{self.high:g}{')' if self.without_high else ']'}"
         return f"{'(0' if self.low == OPEN else f'[{self.low:g}'}, {high}"
 
-    def has(self, number: float, scheduled: bool = False) -> bool:
-        high = max(self.high, self.start) if scheduled else self.high
-        return self.low <= number <= high and not (self.without_high and number == high)
-
     def expected(self, number: float) -> str:
         """What a number that is not in it must do."""
         if self.says:
@@ -121,5 +117,8 @@ def check_number(name: str, number: Real | float, limits: Range | None = None, s
     value = float(number)
     if not math.isfinite(value):
         raise ValueError(f"{name}={value} must be finite")
-    if limits is not None and not limits.has(value, scheduled):
+    if limits is None:
+        return
+    high = max(limits.high, limits.start) if scheduled else limits.high
+    if not limits.low <= value <= high or (limits.without_high and value == high):
         raise ValueError(f"{name}={value:g} must {limits.expected(value)}")

@@ -17,7 +17,7 @@ from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.settings.arguments import FederationArguments
 from sb3_fedguide.settings.names import check_names
 from sb3_fedguide.settings.ranges import check_number, is_schedule, options, range_of
-from sb3_fedguide.settings.signatures import constructors, declared
+from sb3_fedguide.settings.signatures import declared
 
 #: Constructor parameters that have a flag of their own or no meaning on the command line.
 NOT_HYPERPARAMETERS = {
@@ -30,14 +30,20 @@ NOT_HYPERPARAMETERS = {
 SCHEDULE = re.compile(r"^(?P<kind>lin|until)_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)?)$")
 
 
-@functools.cache
 def declared_arguments(algo: str) -> type[FederationArguments]:
     """The dataclass that an algorithm's constructor takes; of an algorithm of the user's own, that of its nearest base."""
     known = ALGORITHMS[algo].arguments
     if known is None:
-        return next(kind for constructor in constructors(algorithm(algo)) if (kind := getattr(constructor, "arguments", None)))
+        taken: list[Any] = [getattr(vars(base).get("__init__"), "arguments", object) for base in algorithm(algo).__mro__]
+        return next(kind for kind in taken if issubclass(kind, FederationArguments))
     module, _, name = known.partition(":")
     return getattr(import_module(module), name)
+
+
+def policies(algo: str) -> tuple[str, ...]:
+    """Names of the policies that an algorithm has."""
+    own = ALGORITHMS[algo].arguments is None
+    return tuple(algorithm(algo).policy_aliases) if own else declared_arguments(algo).policies
 
 
 def hyperparameters(algorithm: type) -> Mapping[str, tuple[Any, Any]]:

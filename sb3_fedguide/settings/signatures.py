@@ -9,7 +9,7 @@ import typing
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from sb3_fedguide.settings.ranges import check_values, plain
+from sb3_fedguide.settings.ranges import plain
 
 P = ParamSpec("P")
 A = TypeVar("A")
@@ -18,18 +18,15 @@ FIRST = ("policy", "env")
 
 
 def takes(arguments: Callable[P, A]) -> Callable[[Callable[[Any, A], None]], Callable[Concatenate[Any, P], None]]:
-    """Of a constructor: it is called with the fields of a dataclass and gets them as one object, complete and checked.
+    """Of a constructor: it is called with the fields of a dataclass and gets them as one object, completed by defaults.
 
     :param arguments: the dataclass, such as :class:`~sb3_fedguide.settings.arguments.FedAvgArguments`
     """
-    hints = types_of(arguments)
 
     def decorate(constructor: Callable[[Any, A], None]) -> Callable[Concatenate[Any, P], None]:
         @functools.wraps(constructor)
         def __init__(self: Any, *args: P.args, **kwargs: P.kwargs) -> None:
-            given = arguments(*args, **kwargs)
-            check_values(hints, vars(given))
-            constructor(self, given)
+            constructor(self, arguments(*args, **kwargs))
 
         __init__.arguments, __init__.hands_on = arguments, False  # type: ignore[attr-defined]
         return typing.cast(Callable[Concatenate[Any, P], None], __init__)
@@ -39,13 +36,12 @@ def takes(arguments: Callable[P, A]) -> Callable[[Callable[[Any, A], None]], Cal
 
 def adds(arguments: Callable[..., A]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Of a mixin's constructor: as :func:`takes`, and what the dataclass does not know comes after it, to be handed on."""
-    hints = types_of(arguments)
+    names = [field.name for field in dataclasses.fields(arguments)]  # type: ignore[arg-type]
 
     def decorate(constructor: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(constructor)
         def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
-            given = arguments(**{name: kwargs.pop(name) for name in hints if name in kwargs})
-            check_values(hints, vars(given))
+            given = arguments(**{name: kwargs.pop(name) for name in names if name in kwargs})
             constructor(self, given, *args, **kwargs)
 
         __init__.arguments, __init__.hands_on = arguments, True  # type: ignore[attr-defined]
