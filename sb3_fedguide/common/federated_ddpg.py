@@ -279,7 +279,7 @@ class FederatedDDPG(Federation, DDPG):
                 self.note_episode(int(client), info)
         return next_obs, terminations
 
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+    def train(self, gradient_steps: int, batch_size: int = FederatedDDPGArguments.batch_size) -> None:
         """SB3's DDPG update for all clients at once; their losses are summed, so that no gradient mixes two clients."""
         assert self.replay_buffer is not None
         actor_parameters = self.policy.actor_parameters
