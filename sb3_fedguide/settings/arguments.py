@@ -40,10 +40,8 @@ Copies = Annotated[int, Range(1, 1000)]
 Positive = Annotated[float, Range(OPEN)]
 NotNegative = Annotated[float, Range(0)]
 Share = Annotated[float, Range(0, 1)]
-AverageEvery = Annotated[int, Range(1, says="be at least 1 round")]
-ServerStep = Annotated[
-    float | Literal["exp"], Range(OPEN, says="be a positive number, or 'exp' for FedExP's; 1 is the average itself")
-]
+ServerStep = Annotated[float | Literal["exp"], Range(OPEN, why="1 is the average itself, and 'exp' FedExP's step")]
+Mix = Annotated[float, Range(0, 1, "it is the share of what the server sends that a client takes", start=100)]
 Tested = Annotated[float, Range(0, 0.5)]
 Rounds = Annotated[int, Range(1, 1e7)]
 
@@ -123,23 +121,13 @@ class AveragingArguments:
     """Those of :class:`~sb3_fedguide.common.parameter_averaging.ParameterAveraging` beside its learner's."""
 
     average: Average = "all"
-    average_every: AverageEvery = 1
+    average_every: Count = 1
     average_until: Count | None = None
     aggregator: Aggregator = "mean"
-    trim_fraction: Annotated[
-        float, Range(0, 0.5, "lie in [0, 0.5): so much is left out on either side", without_high=True)
-    ] = 0.25
+    trim_fraction: Annotated[float, Range(0, 0.5, "so much is left out on either side", without_high=True)] = 0.25
     server_step: ServerStep = 1.0
-    server_momentum: Annotated[
-        float, Range(0, 1, "lie in [0, 1): it is what is kept of the last update", without_high=True)
-    ] = 0.0
-    mix: (
-        Annotated[
-            float,
-            Range(0, 1, "lie in [0, 1]: it is the share of what the server sends that a client takes", start=100),
-        ]
-        | Schedule
-    ) = 1.0
+    server_momentum: Annotated[float, Range(0, 1, "it is what is kept of the last update", without_high=True)] = 0.0
+    mix: Mix | Schedule = 1.0
     screening: Tested = 0.0
     noise_multiplier: Annotated[float, Range(0, 1e6)] = 0.0
     clipping_norm: Positive | None = None
@@ -160,11 +148,11 @@ class FedRLArguments(AveragingArguments, FederatedDDPGArguments):
 class FedProxArguments(FedAvgArguments):
     """Those of :class:`~sb3_fedguide.algorithms.fedprox.FedProx`."""
 
-    mu: Annotated[float, Range(0, says="not be negative: it is the weight of the proximal term; 0 is FedAvg")] = 0.01
+    mu: Annotated[float, Range(0, why="it is the weight of the proximal term; 0 is FedAvg")] = 0.01
 
 
 #: Weight of a divergence from another policy.
-Divergence = Annotated[float, Range(0, says="not be negative: it weighs a divergence; 0 leaves it out")]
+Divergence = Annotated[float, Range(0, why="it weighs a divergence; 0 leaves it out")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,8 +167,8 @@ class FedKLArguments(FedAvgArguments):
 class FedSVRPGMArguments(FedAvgArguments):
     """Those of :class:`~sb3_fedguide.algorithms.fedsvrpgm.FedSVRPGM`."""
 
-    beta: Annotated[float, Range(0, 1, "lie in [0, 1]: it is the weight of the plain gradient; 1 is FedAvg")] = 0.2
-    reference_every: AverageEvery = 5
+    beta: Annotated[float, Range(0, 1, "it is the weight of the plain gradient; 1 is FedAvg")] = 0.2
+    reference_every: Count = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,15 +190,11 @@ class FedGuideArguments(FederatedPPOArguments):
     prior_states: Size | None = 512
     density_steps: Count = 6
     sampling_steps: Count = 10
-    beta: (
-        Annotated[float, Range(0, 1, "lie in [0, 1]: it is the online critic's weight in the baseline")]
-        | Schedule
-        | Literal["auto"]
-    ) = 0.5
+    beta: Annotated[float, Range(0, 1, "it is the online critic's weight in the baseline")] | Schedule | Literal["auto"] = 0.5
     critic_target: Literal["online", "blend"] = "online"
     calibrate: bool = False
     n_experts: Annotated[int, Range(1, 1e4)] | None = None
-    eta: Annotated[float, Range(OPEN, says="be positive: it is the entropic regularisation of the transport plan")] = 0.05
+    eta: Annotated[float, Range(OPEN, why="it is the entropic regularisation of the transport plan")] = 0.05
     cost: TransportCost = "score"
     cost_scaling: CostScaling = "max"
     adapt: Literal["none", "advantage"] = "none"
@@ -223,4 +207,4 @@ class FedGuideAArguments(AveragingArguments, FedGuideArguments):
     """Those of :class:`~sb3_fedguide.algorithms.fedguide.FedGuideA`."""
 
     average: Average = "actor"
-    average_every: AverageEvery = 5
+    average_every: Count = 5

@@ -20,14 +20,14 @@ MAX_INTEGER = 2**31
 class Range(NamedTuple):
     """A range of numbers, in the type of what it bounds: ``mu: Annotated[float, Range(0)]``.
 
-    :param says: what comes after "must" where a value is out of the range, with the reason, instead of the bounds
+    :param why: what the message about another number adds to the bounds
     :param without_high: ``high`` itself is not in it
     :param start: what a schedule may begin with, where that is more than ``high``
     """
 
     low: float
     high: float = math.inf
-    says: str = ""
+    why: str = ""
     without_high: bool = False
     start: float = 0.0
 
@@ -37,14 +37,13 @@ class Range(NamedTuple):
         return f"{'(0' if self.low == OPEN else f'[{self.low:g}'}, {high}"
 
     def expected(self, number: float) -> str:
-        """What a number that is not in it must do."""
-        if self.says:
-            return self.says
+        """What a number that is not in it must be."""
         if self.high <= 1:
-            return f"be in (0, {self.high:g}]" if self.low == OPEN else f"be between {self.low:g} and {self.high:g}"
+            within = self.low == OPEN or self.without_high
+            return f"in {self}" if within else f"between {self.low:g} and {self.high:g}"
         if number < self.low:
-            return "be positive" if self.low == OPEN else f"be at least {self.low:g}"
-        return f"be at most {self.high:.0f}"
+            return "positive" if self.low == OPEN else f"at least {self.low:g}"
+        return f"at most {self.high:.0f}"
 
 
 def options(hint: Any) -> list[Any]:
@@ -121,4 +120,4 @@ def check_number(name: str, number: Real | float, limits: Range | None = None, s
         return
     high = max(limits.high, limits.start) if scheduled else limits.high
     if not limits.low <= value <= high or (limits.without_high and value == high):
-        raise ValueError(f"{name}={value:g} must {limits.expected(value)}")
+        raise ValueError(f"{name}={value:g} must be {limits.expected(value)}{limits.why and ': ' + limits.why}")
