@@ -1,4 +1,4 @@
-"""The one table of algorithms: class, server and settings of each. Looking one up imports it; listing imports nothing."""
+"""The one table of algorithms: class, server, arguments and settings. Looking one up imports it; listing imports nothing."""
 
 from __future__ import annotations
 

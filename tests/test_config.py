@@ -244,7 +244,9 @@ def test_signatures_show_and_type_checkers_know_every_parameter(algo):
     shown = inspect.signature(cls).parameters
     assert list(shown)[:2] == ["policy", "env"] and {"learning_rate", "rollout_size", "seed"} < set(shown)
     assert not any(parameter.kind is parameter.VAR_KEYWORD for parameter in shown.values())
-    taken = next(iter(constructors(cls))).arguments
+    constructor = next(iter(constructors(cls)))
+    taken = constructor.arguments
+    assert [*inspect.signature(constructor).parameters] == ["self", *shown]
     assert [*shown] == [*declared(taken)] and schema.declared_arguments(algo) is taken
 
 

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import inspect
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from sb3_fedguide.settings.ranges import plain
@@ -29,6 +29,8 @@ def takes(arguments: Callable[P, A]) -> Callable[[Callable[[Any, A], None]], Cal
             constructor(self, arguments(*args, **kwargs))
 
         __init__.arguments, __init__.hands_on = arguments, False  # type: ignore[attr-defined]
+        own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        __init__.__signature__ = _shown([own, *_stated(__init__)])  # type: ignore[attr-defined]
         return typing.cast(Callable[Concatenate[Any, P], None], __init__)
 
     return decorate
@@ -115,5 +117,8 @@ class CompleteSignature:
     their ranges."""
 
     def __get__(self, instance: Any, owner: type) -> inspect.Signature:
-        shown = [parameter.replace(annotation=plain(parameter.annotation)) for parameter in parameters(owner).values()]
-        return inspect.Signature(shown)
+        return _shown(parameters(owner).values())
+
+
+def _shown(known: Iterable[inspect.Parameter]) -> inspect.Signature:
+    return inspect.Signature([parameter.replace(annotation=plain(parameter.annotation)) for parameter in known])
