@@ -14,6 +14,8 @@ from fed_envs import FAMILIES, Family, load_family
 from fed_envs.registration import environment_id
 from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.settings.config import resolve
+from sb3_fedguide.settings.ranges import range_of
+from sb3_fedguide.settings.signatures import parameters
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
@@ -83,9 +85,9 @@ def parameter_tables(name: str) -> str:
     for base in cls.__mro__[1:]:
         own = {key: text for key, text in _own_parameters(base).items() if key not in known}
         if own:
-            defaults = inspect.signature(base.__init__).parameters  # type: ignore[misc]
-            rows = [f"| `{key}` | {_default(cls, key, defaults[key].default)} | {text} |" for key, text in own.items()]
-            parts += [f"Of `{base.__name__}`:\n", "| parameter | default | meaning |", "|---|---|---|", *rows, ""]
+            rows = [f"| `{key}` | {_default(cls, key)} | {_range(cls, key)} | {text} |" for key, text in own.items()]
+            head = ["| parameter | default | range | meaning |", "|---|---|---|---|"]
+            parts += [f"Of `{base.__name__}`:\n", *head, *rows, ""]
             known |= own.keys()
         if base.__name__ in ("FederatedPPO", "FederatedDDPG"):
             break  # what follows is Stable-Baselines3's, and these constructors state all of it that there is
@@ -101,14 +103,15 @@ def _own_parameters(cls: type) -> dict[str, str]:
     return {entry["name"]: _markdown(entry["text"]) for entry in entries if entry}
 
 
-def _default(cls: type, key: str, stated: object) -> str:
+def _default(cls: type, key: str) -> str:
     """The default that ``cls`` really has: a subclass may hand another one on."""
-    for base in cls.__mro__:
-        parameter = inspect.signature(base.__init__).parameters.get(key) if "__init__" in base.__dict__ else None  # type: ignore[misc]
-        if parameter is not None:
-            stated = parameter.default
-            break
-    return "" if stated is inspect.Parameter.empty else f"`{stated!r}`"
+    default = parameters(cls)[key].default
+    return "" if default is inspect.Parameter.empty else f"`{default!r}`"
+
+
+def _range(cls: type, key: str) -> str:
+    limits = range_of(parameters(cls)[key].annotation)
+    return "" if limits is None else f"{limits}"
 
 
 def _markdown(text: str) -> str:

@@ -1,4 +1,4 @@
-"""The one table of algorithms: class, server and settings of each. Looking one up imports it; listing imports nothing."""
+"""The one table of algorithms: class, server, arguments and settings. Looking one up imports it; listing imports nothing."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ class Entry(NamedTuple):
     :param cls: the class's name
     :param server: ``"module:name"`` of its server's :class:`~sb3_fedguide.server.methods.Method`; ``None`` for that of its
         base class
+    :param arguments: ``"module:name"`` of the dataclass that its constructor takes, where that is known without the class;
+        nothing then needs PyTorch to check a configuration
     :param settings: its YAML file; ``None`` for ``<name>.yml`` in ``zoo_configs``, or else that of the nearest base class
     """
 
@@ -25,25 +27,27 @@ class Entry(NamedTuple):
     cls: str
     server: str | None = None
     settings: Path | None = None
+    arguments: str | None = None
 
 
-def _ours(module: str, cls: str, server: str) -> Entry:
-    return Entry(f"sb3_fedguide.algorithms.{module}", cls, f"sb3_fedguide.server.methods:{server}")
+def _ours(module: str, cls: str, server: str, arguments: str) -> Entry:
+    known = f"sb3_fedguide.settings.arguments:{arguments}Arguments"
+    return Entry(f"sb3_fedguide.algorithms.{module}", cls, f"sb3_fedguide.server.methods:{server}", None, known)
 
 
 #: by command-line name
 ALGORITHMS: dict[str, Entry] = {
-    "local": _ours("local", "Local", "NOTHING"),
-    "pooled": _ours("pooled", "Pooled", "NOTHING"),
-    "fedavg": _ours("fedavg", "FedAvg", "PPO_AVERAGING"),
-    "fedprox": _ours("fedprox", "FedProx", "PPO_AVERAGING"),
-    "fedkl": _ours("fedkl", "FedKL", "PPO_AVERAGING"),
-    "fedsvrpgm": _ours("fedsvrpgm", "FedSVRPGM", "SVRPG_AVERAGING"),
-    "fedrl": _ours("fedrl", "FedRL", "DDPG_AVERAGING"),
-    "fedguide": _ours("fedguide", "FedGuide", "EXPERTS"),
-    "fedguide-p": _ours("fedguide", "FedGuideP", "EXPERTS"),
-    "fedguide-a": _ours("fedguide", "FedGuideA", "EXPERTS_AND_PARAMETERS"),
-    "fedguide-r": _ours("fedguide_r", "FedGuideR", "PPO_AVERAGING_BEYOND"),
+    "local": _ours("local", "Local", "NOTHING", "FederatedPPO"),
+    "pooled": _ours("pooled", "Pooled", "NOTHING", "FederatedPPO"),
+    "fedavg": _ours("fedavg", "FedAvg", "PPO_AVERAGING", "FedAvg"),
+    "fedprox": _ours("fedprox", "FedProx", "PPO_AVERAGING", "FedProx"),
+    "fedkl": _ours("fedkl", "FedKL", "PPO_AVERAGING", "FedKL"),
+    "fedsvrpgm": _ours("fedsvrpgm", "FedSVRPGM", "SVRPG_AVERAGING", "FedSVRPGM"),
+    "fedrl": _ours("fedrl", "FedRL", "DDPG_AVERAGING", "FedRL"),
+    "fedguide": _ours("fedguide", "FedGuide", "EXPERTS", "FedGuide"),
+    "fedguide-p": _ours("fedguide", "FedGuideP", "EXPERTS", "FedGuide"),
+    "fedguide-a": _ours("fedguide", "FedGuideA", "EXPERTS_AND_PARAMETERS", "FedGuideA"),
+    "fedguide-r": _ours("fedguide_r", "FedGuideR", "PPO_AVERAGING_BEYOND", "FedGuideR"),
 }
 
 

@@ -11,6 +11,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,8 @@ from sb3_fedguide import FedGuide, Local
 from sb3_fedguide.cli import recorder
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.main import main as fedguide
-from sb3_fedguide.cli.train import find_family, main, prepare
+from sb3_fedguide.cli.request import find_family, resolve_request
+from sb3_fedguide.cli.train import main, prepare
 from sb3_fedguide.common.evaluation import evaluate_federation, evaluation_env
 
 ROOT = Path(__file__).parents[1]
@@ -33,7 +35,26 @@ TINY_OFFLINE = ["-params", "pretraining.bc_updates:2", "pretraining.dice_updates
 
 def prepared(*argv: str):
     arguments = parse_train(argv, "train.py")
-    return prepare(arguments, find_family(arguments), "")
+    return prepare(resolve_request(arguments, find_family(arguments)), "")
+
+
+def test_nothing_is_read_or_parsed_twice(monkeypatch, tmp_path):
+    """By way of Python's calls: whoever imported a function by name is seen too."""
+    watched, calls = ("read_yaml", "parse_params", "parse_delays", "complete"), Counter()
+    (tmp_path / "mine.yml").write_text("default: {n_rounds: 2, bc_weight: 0, rollout_size: 40, batch_size: 20}")
+
+    def profile(frame, event, _):
+        if event == "call" and frame.f_code.co_name in watched and "sb3_fedguide" in frame.f_code.co_filename:
+            calls[frame.f_code.co_name] += 1
+
+    sys.setprofile(profile)
+    try:
+        run = prepared("--algo", "fedavg", "--env", "Bandit2D", "-conf", str(tmp_path / "mine.yml"), "-params",
+                       "mix:0.5", "--delays", "async:median=60")  # fmt: skip
+    finally:
+        sys.setprofile(None)
+    assert calls == dict.fromkeys(watched, 1)
+    assert run.model.mix == 0.5 and run.model.delays.settings.median == 60 and "median=60.0" in run.arguments.delays
 
 
 WRONG = {

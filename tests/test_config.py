@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import typing
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,8 +15,9 @@ from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.registry import ALGORITHMS, algorithm
 from sb3_fedguide.settings import schema
 from sb3_fedguide.settings.config import CONFIGURATIONS, OVERLAYS, config_path, parse_params, read_config, resolve
-from sb3_fedguide.settings.signatures import constructors
+from sb3_fedguide.settings.signatures import constructors, declared
 
+ROOT = Path(__file__).parent.parent
 BANDIT = fed_envs.load_family("Bandit2D")
 
 
@@ -243,11 +245,27 @@ def test_signatures_show_and_type_checkers_know_every_parameter(algo):
     assert list(shown)[:2] == ["policy", "env"] and {"learning_rate", "rollout_size", "seed"} < set(shown)
     assert not any(parameter.kind is parameter.VAR_KEYWORD for parameter in shown.values())
     constructor = next(iter(constructors(cls)))
-    own = inspect.signature(constructor).parameters
-    keywords = [name for name, parameter in own.items() if parameter.kind is parameter.VAR_KEYWORD]
-    for keyword in keywords:  # a TypedDict, with every parameter that is left and its type
-        told = typing.get_type_hints(typing.get_args(typing.get_type_hints(constructor)[keyword])[0])
-        assert set(shown) - set(own) <= set(told) and not set(own) & set(told)
-        assert {name: shown[name].annotation for name in set(shown) - set(own)} == {
-            name: told[name] for name in set(shown) - set(own)
-        }
+    taken = constructor.arguments
+    assert [*inspect.signature(constructor).parameters] == ["self", *shown]
+    assert [*shown] == [*declared(taken)] and schema.declared_arguments(algo) is taken
+
+
+WRONG_CALLS = """
+from sb3_fedguide import FedAvg, FedGuideA, FedKL, FedRL, Local
+class Mine(FedAvg): pass
+FedKL("MlpPolicy", env="HopperHard", lambda_global=1, seed=3, mix=lambda left: left)
+FedKL("MlpPolicy", "HopperHard", learning_rte=1)
+Local("MlpPolicy", "HopperHard", mu=1)
+FedRL("MlpPolicy", "HopperHard", n_epochs=3)
+FedGuideA("MlpPolicy", "HopperHard", average="every")
+Mine("MlpPolicy", "HopperHard", mu=1)
+"""
+
+
+@pytest.mark.slow
+def test_a_type_checker_refuses_what_constructors_do_not_take(tmp_path):
+    path = tmp_path / "calls.py"
+    path.write_text(WRONG_CALLS)
+    result = subprocess.run([sys.executable, "-m", "mypy", str(path)], cwd=ROOT, capture_output=True, text=True)
+    wrong = {int(line.split(":")[1]) for line in result.stdout.splitlines() if ": error:" in line}
+    assert wrong == {5, 6, 7, 8, 9}, result.stdout

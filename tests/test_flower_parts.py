@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 import yaml
 
+import fed_envs
 from sb3_fedguide.cli.main import main as fedguide
 from sb3_fedguide.deployment.transport import Failure, Message
+from sb3_fedguide.settings.config import resolve
 from tests.flower_deployment import CLIENT, SMALL
 
 pytestmark = pytest.mark.flower
@@ -54,6 +56,8 @@ WRONG = [
     ("server", {"timeout": 0}, "timeout"),
     ("server", {"params": {"eta": 0}}, "eta"),
     ("server", {"params": {"eta": "high"}}, "eta"),
+    ("server", {"params": {"learnin_rate": 1}}, "Did you mean 'learning_rate'"),
+    ("server", {"params": {"gamma": 2}}, "gamma=2 must be between 0 and 1"),
     ("server", {"listen": "9443"}, "no address"),
     ("server", {"listen": "0.0.0.0:94430"}, "no address"),
     ("server", {"certificates": "nowhere"}, "fedguide deploy certificates"),
@@ -85,17 +89,22 @@ def test_wrong_configurations_are_refused_in_one_line(keys: Path, kind: str, cha
 
 
 def test_the_server_takes_what_concerns_it_from_the_clients_settings(keys: Path) -> None:
-    from sb3_fedguide.common.federated_ddpg import FederatedDDPG
-    from sb3_fedguide.common.federated_ppo import FederatedPPO
-    from sb3_fedguide.deployment.config_files import ROLLOUT_SIZE, ServerDeployment
-    from sb3_fedguide.settings.schema import hyperparameters
+    from sb3_fedguide.deployment.config_files import ServerDeployment
 
     path = keys / "server.yml"
     path.write_text(yaml.safe_dump({**SERVER, "params": {"eta": 0.2, "learning_rate": 1e-3, "n_rounds": 7}}))
     server = ServerDeployment(path).server
     assert (server.n_rounds, server.rollout_size, server.settings) == (7, 200, {"eta": 0.2, "normalize": False})
-    for cls in (FederatedPPO, FederatedDDPG):
-        assert hyperparameters(cls)["rollout_size"][1] == ROLLOUT_SIZE
+
+
+def test_the_server_takes_the_quick_settings_as_clients_do(keys: Path) -> None:
+    from sb3_fedguide.deployment.config_files import ServerDeployment
+
+    path = keys / "server.yml"
+    path.write_text(yaml.safe_dump({**SERVER, "conf": "quick"}))
+    quick = resolve("fedguide", fed_envs.load_family("Bandit2D"), "quick")
+    server = ServerDeployment(path).server
+    assert (server.n_rounds, server.rollout_size) == (quick.n_rounds, quick.values["rollout_size"])
 
 
 def test_settings_are_where_the_file_says_whatever_the_working_directory_is(

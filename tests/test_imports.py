@@ -48,6 +48,25 @@ def test_package_and_help_load_nothing_heavy(command: tuple[str, ...]) -> None:
     assert not HEAVY & names
 
 
+RESOLVED = """
+import sys
+import fed_envs
+from sb3_fedguide.cli.train import main
+from sb3_fedguide.registry import ALGORITHMS
+from sb3_fedguide.settings.config import CONFIGURATIONS, resolve
+for algo in ALGORITHMS:
+    for conf in CONFIGURATIONS:
+        resolve(algo, fed_envs.load_family("HopperHard"), conf, overrides={"gamma": 0.9})
+assert main(["--env", "HopperHard", "-params", "gama:1"]) == main(["--env", "HopperHard", "-params", "gamma:2"]) == 2
+print(sorted({"torch", "stable_baselines3", "mujoco"} & set(sys.modules)))
+"""
+
+
+def test_hyperparameters_are_resolved_and_refused_without_pytorch() -> None:
+    result = subprocess.run([sys.executable, "-c", RESOLVED], cwd=ROOT, check=True, capture_output=True, text=True)
+    assert result.stdout == "[]\n"
+
+
 def test_every_public_name_can_be_loaded() -> None:
     for name in sb3_fedguide.__all__:
         assert getattr(sb3_fedguide, name) is not None

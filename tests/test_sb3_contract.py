@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 import numpy as np
 import pytest
 import torch as th
@@ -10,9 +12,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.ppo import MlpPolicy
 
 from fed_envs import FederatedVecEnv
-from sb3_fedguide import FedAvg, FederatedDDPG, FederatedPPO, FedGuide, FedProx, FedRL, Local
+from sb3_fedguide import FedAvg, FederatedDDPG, FederatedPPO, FedGuide, FedKL, FedProx, FedRL, FedSVRPGM, Local
 from sb3_fedguide.common.episodes import EpisodeStatistics
-from sb3_fedguide.settings.ranges import RANGES, check_ranges
+from sb3_fedguide.settings import schema
+from sb3_fedguide.settings.ranges import Range, check_values, range_of
+from sb3_fedguide.settings.schema import hyperparameters
+from sb3_fedguide.settings.signatures import types_of
 from tests.environments import PointEnv
 from tests.loop_engine import Here
 
@@ -176,27 +181,41 @@ def test_one_client_carries_all_settings(point_envs):
 
 def test_every_range_is_checked_by_the_constructors(point_envs):
     """Before the environments are made, so before the offline stage."""
-    algorithms = [FedGuide, FedProx, FedRL]
-    for name, limits in RANGES.items():
-        if name in ("n_rounds", "lambda_global", "lambda_local", "reference_every"):
-            continue  # no constructor's; FedKL's and FedSVRPG-M's
-        kind = next(kind for kind in algorithms if name in _names(kind))
-        with pytest.raises(ValueError, match=name):
-            kind("MlpPolicy", point_envs(2), **{name: limits.low - 1})
-        with pytest.raises(ValueError, match=f"{name} must be a"):
-            check_ranges({name: "many"})
+    for kind in (FedGuide, FedProx, FedKL, FedSVRPGM, FedRL):
+        for name, hint in types_of(kind).items():
+            if (limits := range_of(hint)) is None:
+                continue
+            with pytest.raises(ValueError, match=name):
+                kind("MlpPolicy", point_envs(2), **{name: limits.low - 1})
+            with pytest.raises(ValueError, match=f"{name} must be a"):
+                check_values(types_of(kind), {name: "many"})
     for name, value in {"n_epochs": 2.5, "gamma": float("nan"), "clip_range_vf": -0.2, "n_epochs ": None}.items():
         with pytest.raises(ValueError, match=name.strip()):
             Local("MlpPolicy", point_envs(2), **{name.strip(): value})
     with pytest.raises(ValueError, match="learning_rate"):
         Local("MlpPolicy", point_envs(2), learning_rate=lambda left: -left)
-    check_ranges({"n_epochs": np.int64(2), "gamma": np.float32(0.9), "clip_range_vf": None, "beta": "auto"})
+    check_values(
+        types_of(FedGuide), {"n_epochs": np.int64(2), "gamma": np.float32(0.9), "clip_range_vf": None, "beta": "auto"}
+    )
 
 
-def _names(cls):
-    from sb3_fedguide.settings.schema import hyperparameters
+class Own(FedAvg):
+    def __init__(self, policy, env, kappa: Annotated[float, Range(0, 1)] = 0.5, kind: Literal["a", "b"] = "a", **fedavg):
+        self.kappa, self.kind = kappa, kind
+        super().__init__(policy, env, **fedavg)
 
-    return {*hyperparameters(cls), "num_threads"}
+
+def test_a_constructor_of_ones_own_states_its_ranges_in_its_types(point_envs):
+    assert hyperparameters(Own)["kappa"][1] == 0.5 and "mix" in hyperparameters(Own)
+    assert Own("MlpPolicy", point_envs(2), 0.7, mix=0.5, **PPO_SIZES, **NETWORK).kappa == 0.7
+    for wrong, message in (
+        ({"kappa": 1.5}, "kappa=1.5 must be between 0 and 1"),
+        ({"kind": "c"}, "must be one of a, b"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Own("MlpPolicy", point_envs(2), **wrong, **PPO_SIZES, **NETWORK)
+    with pytest.raises(ValueError, match="kappa=2 must be"):
+        schema.check_value("kappa", 2, hyperparameters(Own)["kappa"][0])
 
 
 def test_ranges_hold_for_what_load_changes(point_envs, tmp_path):

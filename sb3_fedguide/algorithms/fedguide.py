@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal, Unpack
+from typing import ClassVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.type_aliases import Schedule
 
 from fed_envs.state import State
 from sb3_fedguide.algorithms.fedguide_parts import begin_parts, offline_parts, part_arrays, set_part_arrays
-from sb3_fedguide.common.arguments import FederatedPPOArguments, FedGuideAArguments
 from sb3_fedguide.common.federated_ppo import FederatedPPO
-from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.parameter_averaging import ParameterAveraging
 from sb3_fedguide.common.rollout_buffer import FederatedSamples, generalized_advantage
 from sb3_fedguide.common.value_blend import baseline_metrics, optimal_blend
@@ -26,6 +23,8 @@ from sb3_fedguide.priors.mixture import mixture_log_prob, mixture_sample
 from sb3_fedguide.seeding import Role
 from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW
 from sb3_fedguide.server.strategy import Payload
+from sb3_fedguide.settings.arguments import FederatedPPOArguments, FedGuideAArguments, FedGuideArguments
+from sb3_fedguide.settings.signatures import takes
 from sb3_fedguide.state.stacked import to_arrays, to_tensors
 
 #: Raw actions further outside the action box than this get no importance weight: no behaviour data can lie there.
@@ -74,61 +73,31 @@ class FedGuide(FederatedPPO):
     )  # fmt: skip
     shared_state = ("parts", "modules.prior")
 
-    def __init__(
-        self,
-        policy: PolicyLike,
-        env: FederationLike | None,
-        lambda_trust: float = 0.05,
-        lambda_prior: float = 0.5,
-        prior_horizon: int = 50,
-        prior_loss: Literal["snis", "sample"] = "snis",
-        prior_states: int | None = 512,
-        density_steps: int = 6,
-        sampling_steps: int = 10,
-        beta: float | Schedule | Literal["auto"] = 0.5,
-        critic_target: Literal["online", "blend"] = "online",
-        calibrate: bool = False,
-        n_experts: int | None = None,
-        eta: float = 0.05,
-        cost: Literal["score", "param"] = "score",
-        cost_scaling: Literal["max", "median"] = "max",
-        adapt: Literal["none", "advantage"] = "none",
-        adapt_temperature: float = 1.0,
-        adapt_weight: float = 0.5,
-        **ppo: Unpack[FederatedPPOArguments],
-    ) -> None:
-        _check_choice("prior_loss", prior_loss, ("snis", "sample"))
-        _check_choice("critic_target", critic_target, ("online", "blend"))
-        _check_choice("adapt", adapt, ("none", "advantage"))
-        if isinstance(beta, str):
-            _check_choice("beta", beta, ("auto",))
-        elif not callable(beta) and not 0.0 <= beta <= 1.0:
-            raise ValueError(f"beta={beta} must lie in [0, 1]: it is the online critic's weight in the baseline")
-        if min(lambda_trust, lambda_prior) < 0 or prior_horizon < 1:
-            raise ValueError("lambda_trust and lambda_prior must not be negative, and prior_horizon must be at least 1")
-        self.lambda_trust = lambda_trust
-        self.lambda_prior = lambda_prior
-        self.prior_horizon = prior_horizon
-        self.prior_loss = prior_loss
-        self.prior_states = prior_states
-        self.density_steps = density_steps
-        self.sampling_steps = sampling_steps
-        self.beta = beta
-        self.critic_target = critic_target
-        self.calibrate = calibrate
-        self.n_experts = n_experts
-        self.eta = eta
-        self.cost = cost
-        self.cost_scaling = cost_scaling
-        self.adapt = adapt
-        self.adapt_temperature = adapt_temperature
-        self.adapt_weight = adapt_weight
+    @takes(FedGuideArguments)
+    def __init__(self, given: FedGuideArguments) -> None:
+        self.lambda_trust = given.lambda_trust
+        self.lambda_prior = given.lambda_prior
+        self.prior_horizon = given.prior_horizon
+        self.prior_loss = given.prior_loss
+        self.prior_states = given.prior_states
+        self.density_steps = given.density_steps
+        self.sampling_steps = given.sampling_steps
+        self.beta = given.beta
+        self.critic_target = given.critic_target
+        self.calibrate = given.calibrate
+        self.n_experts = given.n_experts
+        self.eta = given.eta
+        self.cost = given.cost
+        self.cost_scaling = given.cost_scaling
+        self.adapt = given.adapt
+        self.adapt_temperature = given.adapt_temperature
+        self.adapt_weight = given.adapt_weight
         self.prior: Prior | None = None
         self.dice: DiceValue | None = None
         self.dice_scale: np.ndarray | None = None  # (n_clients, 2): a and b of the calibration
         self.adaptation: HeadAdaptation | None = None
         self.experts: np.ndarray | None = None  # what each client last received, (n_clients, n_experts, ...)
-        super().__init__(policy, env, **ppo)
+        super().__init__(**given.of(FederatedPPOArguments))
 
     def upload(self, index: int) -> Payload:
         payload: Payload = {HEAD: self.heads[index]}
@@ -366,17 +335,6 @@ class FedGuideA(ParameterAveraging, FedGuide):
     :class:`FedGuide`.
     """
 
-    def __init__(
-        self,
-        policy: PolicyLike,
-        env: FederationLike | None,
-        average: Literal["all", "actor", "critic"] = "actor",
-        average_every: int = 5,
-        **fedguide: Unpack[FedGuideAArguments],
-    ) -> None:
-        super().__init__(policy, env, average=average, average_every=average_every, **fedguide)  # type: ignore[misc]
-
-
-def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name}={value!r} must be one of {', '.join(choices)}")
+    @takes(FedGuideAArguments)
+    def __init__(self, given: FedGuideAArguments) -> None:
+        super().__init__(**vars(given))

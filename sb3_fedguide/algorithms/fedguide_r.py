@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal, Unpack
-
 from sb3_fedguide.algorithms.fedavg import FedAvg
-from sb3_fedguide.common.arguments import FedGuideRArguments
-from sb3_fedguide.common.federation import FederationLike, PolicyLike
+from sb3_fedguide.settings.arguments import FedGuideRArguments
+from sb3_fedguide.settings.signatures import takes
 
 
 class FedGuideR(FedAvg):
@@ -24,12 +22,6 @@ class FedGuideR(FedAvg):
     Parameters are those of :class:`FedAvg`, with other defaults.
     """
 
-    def __init__(
-        self,
-        policy: PolicyLike,
-        env: FederationLike | None,
-        server_step: float | Literal["exp"] = 2.0,
-        screening: float = 0.05,
-        **fedavg: Unpack[FedGuideRArguments],
-    ) -> None:
-        super().__init__(policy, env, server_step=server_step, screening=screening, **fedavg)
+    @takes(FedGuideRArguments)
+    def __init__(self, given: FedGuideRArguments) -> None:
+        super().__init__(**vars(given))

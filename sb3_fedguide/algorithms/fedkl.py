@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Unpack
-
-import numpy as np
 import torch as th
 
 from sb3_fedguide.algorithms.fedprox import AnchoredFedAvg
 from sb3_fedguide.common.anchors import actor_at
-from sb3_fedguide.common.arguments import FedAvgArguments
-from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.rollout_buffer import FederatedSamples
+from sb3_fedguide.settings.arguments import FedAvgArguments, FedKLArguments
+from sb3_fedguide.settings.signatures import takes
 
 
 class FedKL(AnchoredFedAvg):
@@ -34,25 +31,16 @@ class FedKL(AnchoredFedAvg):
     All other parameters are those of :class:`FedAvg`.
     """
 
-    def __init__(
-        self,
-        policy: PolicyLike,
-        env: FederationLike | None,
-        lambda_global: float = 0.1,
-        lambda_local: float = 0.05,
-        **fedavg: Unpack[FedAvgArguments],
-    ) -> None:
-        for name, weight in (("lambda_global", lambda_global), ("lambda_local", lambda_local)):
-            if not 0 <= weight < np.inf:
-                raise ValueError(f"{name}={weight} must not be negative: it weighs a divergence; 0 leaves it out")
-        if fedavg.get("average") == "critic":
+    @takes(FedKLArguments)
+    def __init__(self, given: FedKLArguments) -> None:
+        if given.average == "critic":
             raise ValueError(
                 "FedKL stays near the broadcast policy, and average='critic' broadcasts none; use 'all' or 'actor'"
             )
-        self.lambda_global = lambda_global
-        self.lambda_local = lambda_local
+        self.lambda_global = given.lambda_global
+        self.lambda_local = given.lambda_local
         self._log_stds: dict[str, th.Tensor | None] = {}
-        super().__init__(policy, env, **fedavg)
+        super().__init__(**given.of(FedAvgArguments))
 
     @th.no_grad()
     def _prepare_training(self) -> None:

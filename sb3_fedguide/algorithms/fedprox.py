@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Unpack
-
-import numpy as np
 import torch as th
 
 from sb3_fedguide.algorithms.fedavg import FedAvg
 from sb3_fedguide.common.anchors import Parameters, snapshot
-from sb3_fedguide.common.arguments import FedAvgArguments
-from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.rollout_buffer import FederatedSamples
 from sb3_fedguide.server.strategy import Payload
+from sb3_fedguide.settings.arguments import FedAvgArguments, FedProxArguments
+from sb3_fedguide.settings.signatures import takes
 
 
 class AnchoredFedAvg(FedAvg):
@@ -24,9 +21,10 @@ class AnchoredFedAvg(FedAvg):
 
     state_attributes = ("anchor",)
 
-    def __init__(self, policy: PolicyLike, env: FederationLike | None, **fedavg: Unpack[FedAvgArguments]) -> None:
+    @takes(FedAvgArguments)
+    def __init__(self, given: FedAvgArguments) -> None:
         self.anchor: Parameters = {}  # theta_bar as each client last received it
-        super().__init__(policy, env, **fedavg)
+        super().__init__(**vars(given))
 
     def receive(self, index: int, broadcast: Payload) -> None:
         self._initialize_anchor()
@@ -60,14 +58,11 @@ class FedProx(AnchoredFedAvg):
     All other parameters are those of :class:`FedAvg`.
     """
 
-    def __init__(
-        self, policy: PolicyLike, env: FederationLike | None, mu: float = 0.01, **fedavg: Unpack[FedAvgArguments]
-    ) -> None:
-        if not 0 <= mu < np.inf:
-            raise ValueError(f"mu={mu} must not be negative: it is the weight of the proximal term; 0 is FedAvg")
-        self.mu = mu
+    @takes(FedProxArguments)
+    def __init__(self, given: FedProxArguments) -> None:
+        self.mu = given.mu
         self._anchor_tensors: dict[str, th.Tensor] = {}
-        super().__init__(policy, env, **fedavg)
+        super().__init__(**given.of(FedAvgArguments))
 
     def _prepare_training(self) -> None:
         super()._prepare_training()

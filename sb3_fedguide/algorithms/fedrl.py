@@ -5,6 +5,8 @@ from __future__ import annotations
 from sb3_fedguide.common.federated_ddpg import FederatedDDPG
 from sb3_fedguide.common.parameter_averaging import ParameterAveraging
 from sb3_fedguide.server.strategy import Payload
+from sb3_fedguide.settings.arguments import FedRLArguments
+from sb3_fedguide.settings.signatures import takes
 
 
 class FedRL(ParameterAveraging, FederatedDDPG):
@@ -17,6 +19,10 @@ class FedRL(ParameterAveraging, FederatedDDPG):
     Parameters are those of :class:`~sb3_fedguide.common.parameter_averaging.ParameterAveraging` and of
     :class:`FederatedDDPG`.
     """
+
+    @takes(FedRLArguments)
+    def __init__(self, given: FedRLArguments) -> None:
+        super().__init__(**vars(given))
 
     def receive(self, index: int, broadcast: Payload) -> None:
         super().receive(index, broadcast)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Unpack
-
 import numpy as np
 import torch as th
 
 from sb3_fedguide.algorithms.fedavg import FedAvg
 from sb3_fedguide.common.anchors import Parameters, actor_at, snapshot
-from sb3_fedguide.common.arguments import FedAvgArguments
-from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.ppo_policy import ACTOR_PREFIXES, StackedActor
 from sb3_fedguide.common.rollout_buffer import FederatedSamples
 from sb3_fedguide.server.strategy import Payload
 from sb3_fedguide.server.svrpg import DIRECTION
+from sb3_fedguide.settings.arguments import FedAvgArguments, FedSVRPGMArguments
+from sb3_fedguide.settings.signatures import takes
 
 
 class FedSVRPGM(FedAvg):
@@ -42,22 +40,12 @@ class FedSVRPGM(FedAvg):
 
     state_attributes = ("reference", "reference_period", "momentum", "directions")
 
-    def __init__(
-        self,
-        policy: PolicyLike,
-        env: FederationLike | None,
-        beta: float = 0.2,
-        reference_every: int = 5,
-        **fedavg: Unpack[FedAvgArguments],
-    ) -> None:
-        if not 0.0 <= beta <= 1.0:
-            raise ValueError(f"beta={beta} must lie in [0, 1]: it is the weight of the plain gradient; 1 is FedAvg")
-        if reference_every < 1:
-            raise ValueError(f"reference_every={reference_every} must be at least 1 round")
-        if fedavg.get("average") == "critic":
+    @takes(FedSVRPGMArguments)
+    def __init__(self, given: FedSVRPGMArguments) -> None:
+        if given.average == "critic":
             raise ValueError("FedSVRPG-M shares the actors' directions, and average='critic' no actor; use 'all' or 'actor'")
-        self.beta = beta
-        self.reference_every = reference_every
+        self.beta = given.beta
+        self.reference_every = given.reference_every
         self.reference: Parameters = {}  # theta_ref of each client
         self.reference_period = np.zeros(0, dtype=int)  # when each took it, counted in periods of `reference_every` rounds
         self.momentum: Parameters = {}  # u_r as each client last received it
@@ -67,7 +55,7 @@ class FedSVRPGM(FedAvg):
         self._momentum_tensors: dict[str, th.Tensor] = {}
         self._direction_sums: dict[str, th.Tensor] = {}
         self._n_directions = 0
-        super().__init__(policy, env, **fedavg)
+        super().__init__(**given.of(FedAvgArguments))
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Unpack
+from typing import ClassVar
 
 import torch as th
 
-from sb3_fedguide.common.arguments import FederatedPPOArguments
 from sb3_fedguide.common.federated_ppo import FederatedPPO
-from sb3_fedguide.common.federation import FederationLike, PolicyLike
 from sb3_fedguide.common.rollout_buffer import FederatedSamples
 from sb3_fedguide.offline.pretraining import Pretraining
+from sb3_fedguide.settings.arguments import FederatedPPOArguments
+from sb3_fedguide.settings.signatures import takes
 
 #: What a one-hot client vector as a further input of both networks is: a first-layer bias for each client.
 CLIENT_INPUT = ("mlp_extractor.policy_net.0.bias", "mlp_extractor.value_net.0.bias")
@@ -30,10 +30,11 @@ class Pooled(FederatedPPO):
 
     is_federated: ClassVar[bool] = False
 
-    def __init__(self, policy: PolicyLike, env: FederationLike | None, **ppo: Unpack[FederatedPPOArguments]) -> None:
-        if ppo.get("client_fraction", 1.0) != 1.0:
+    @takes(FederatedPPOArguments)
+    def __init__(self, given: FederatedPPOArguments) -> None:
+        if given.client_fraction != 1.0:
             raise ValueError("Pooled has all clients' data in every minibatch; leave client_fraction at 1")
-        super().__init__(policy, env, **ppo)
+        super().__init__(**vars(given))
 
     @th.no_grad()
     def _pretrain(self, stage: Pretraining) -> None:

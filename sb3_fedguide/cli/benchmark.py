@@ -22,14 +22,9 @@ from sb3_fedguide.cli.benchmark_results import (
     write_tables,
 )
 from sb3_fedguide.cli.output import pipe_may_close
+from sb3_fedguide.cli.request import Request, find_family, resolve_request
 from sb3_fedguide.cli.run import one_message
-from sb3_fedguide.cli.train import (
-    EXIT_INTERRUPTED,
-    check_before_imports,
-    find_family,
-    prepare,
-    resolved,
-)
+from sb3_fedguide.cli.train import EXIT_INTERRUPTED, prepare
 from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.settings.packages import import_packages
@@ -134,30 +129,28 @@ def make_plan(arguments: argparse.Namespace, prog: str) -> Plan:
     sources, families, rows = _sources(arguments), find_families(arguments, prog), asked_rows(arguments)
     if arguments.table_only:
         return Plan(families, rows, results=require_results(arguments.folder, families, rows))
-    combinations = []
+    checked: list[tuple[list[str], Request]] = []
     for family, source in zip(families.values(), sources, strict=True):
         for method in methods:
             own = ["--algo", method, *source, *flags]
             parsed = parse_train([*own, "-f", arguments.folder, "--seed", str(max(arguments.seeds or SEEDS))], prog)
-            check_before_imports(parsed)
-            combinations.append((method, family, own, parsed))
+            checked.append((own, resolve_request(parsed, family)))
     runs: list[BenchmarkRun] = []
     configs: list[Config] = []
     done: list[BenchmarkRun] = []
-    checked = [(method, family, own, parsed, resolved(parsed, family)) for method, family, own, parsed in combinations]
     missing = []
     for seed in arguments.seeds or SEEDS:
-        for number, (method, family, own, _, config) in enumerate(checked):
-            run = _benchmark_run(arguments, method, family, seed, own)
-            _check_earlier(run, family, config, arguments)
+        for number, (own, request) in enumerate(checked):
+            run = _benchmark_run(arguments, request, seed, own)
+            _check_earlier(run, request)
             if run.result.is_file():
                 done.append(run)
             else:
                 runs.append(run)
-                configs.append(config)
+                configs.append(request.config)
                 missing.append(number)
     for number in () if arguments.dry_run else sorted(set(missing)):
-        prepare(checked[number][3], checked[number][1], "")  # whether the settings fit the environments
+        prepare(checked[number][1], "")  # whether the settings fit the environments
     return Plan(families, rows, runs, configs, done)
 
 
@@ -179,18 +172,17 @@ def find_families(arguments: argparse.Namespace, prog: str) -> dict[str, Family]
     return families
 
 
-def _benchmark_run(
-    arguments: argparse.Namespace, method: str, family: Family, seed: int, flags: Sequence[str]
-) -> BenchmarkRun:
+def _benchmark_run(arguments: argparse.Namespace, request: Request, seed: int, flags: Sequence[str]) -> BenchmarkRun:
     from sb3_fedguide.benchmark.results import result_path
     from sb3_fedguide.cli.benchmark_runs import BenchmarkRun, log_folder_of
 
-    result = result_path(Path(arguments.folder).absolute(), family.name, arguments.label, method, seed)
+    method, family = request.arguments.algo, request.family.name
+    result = result_path(Path(arguments.folder).absolute(), family, arguments.label, method, seed)
     log_folder = log_folder_of(result)
     quiet = ("--verbose", "0", *(() if arguments.keep_runs else ("--picture-freq", "0")))
     return BenchmarkRun(
         method=method,
-        family=family.name,
+        family=family,
         seed=seed,
         result=result,
         log_folder=log_folder,
@@ -200,23 +192,22 @@ def _benchmark_run(
     )
 
 
-def _check_earlier(run: BenchmarkRun, family: Family, config: Config, arguments: argparse.Namespace) -> None:
+def _check_earlier(run: BenchmarkRun, request: Request) -> None:
     """:raises ValueError: if the run has been done, or begun, with other settings than those that are asked for"""
     from sb3_fedguide.benchmark.results import read_result
     from sb3_fedguide.cli.benchmark_runs import interrupted_folder
-    from sb3_fedguide.cli.delays import read_delays
     from sb3_fedguide.settings.config import read_yaml
 
     now = {
-        **config.values,
-        "clients": family.content_hash,
-        "--delays": arguments.delays and str(read_delays(arguments.delays)),
+        **request.config.values,
+        "clients": request.family.content_hash,
+        "--delays": request.arguments.delays,
     }
     if run.result.is_file():
         result, where = read_result(run.result), run.result
         before: dict[str, Any] = {"n_rounds": result.n_rounds, **(result.config or {}), "clients": result.metadata_hash}
         before["--delays"] = result.delays
-        before["--eval-episodes"], now["--eval-episodes"] = result.n_episodes, arguments.eval_episodes
+        before["--eval-episodes"], now["--eval-episodes"] = result.n_episodes, request.arguments.eval_episodes
     elif (folder := interrupted_folder(run.log_folder, run.method)) is not None:
         where = folder
         before = {**read_yaml(folder / "config.yml"), "clients": (folder / "metadata.sha256").read_text().strip()}

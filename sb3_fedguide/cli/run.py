@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,12 +13,11 @@ from sb3_fedguide.exit_codes import EXIT_USAGE
 if TYPE_CHECKING:
     from stable_baselines3.common.logger import TensorBoardOutputFormat
 
-    from fed_envs import Family
+    from sb3_fedguide.cli.request import Request
     from sb3_fedguide.cli.tracking import TrackerOutputFormat
     from sb3_fedguide.common.callbacks import RoundCallback
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
-    from sb3_fedguide.settings.config import Config
 
 LONGEST_MESSAGE = 2000
 
@@ -29,18 +27,20 @@ class Run:
 
     def __init__(
         self,
-        arguments: argparse.Namespace,
+        request: Request,
         command: str,
-        config: Config,
-        family: Family,
         model: FederatedPPO | FederatedDDPG,
         folder: Path | None = None,
+        longer: bool = False,
     ) -> None:
-        """:param folder: where the run is, if it goes on"""
-        self.folder = folder
+        """:param folder: where the run is, if it goes on
+        :param longer: whether it is then to have other rounds than it was to have
+        """
+        self.folder, self.longer = folder, longer
         #: what keeps other processes out of that folder
         self.lock = ExitStack()
-        self.arguments, self.command, self.config, self.family, self.model = arguments, command, config, family, model
+        self.arguments, self.config, self.family = request.arguments, request.config, request.family
+        self.command, self.model = command, model
 
     def __call__(self) -> int:
         from sb3_fedguide.cli.run_folder import create_run_folder, exclusive
@@ -48,7 +48,8 @@ class Run:
         arguments = self.arguments
         if self.folder is not None:
             with self.lock:
-                self._record_length(self.folder)
+                if self.longer:
+                    self._record_length(self.folder)
                 with (self.folder / "command.txt").open("a", encoding="utf-8") as file:
                     file.write(self.command + "\n")
                 return self._run(self.folder)
@@ -122,8 +123,6 @@ class Run:
         from sb3_fedguide.cli.run_folder import write_yaml
         from sb3_fedguide.settings.config import read_yaml
 
-        if read_yaml(folder / "config.yml")["n_rounds"] == self.config.n_rounds:
-            return
         write_yaml(folder / "config.yml", self.config.values)
         write_yaml(folder / "args.yml", {**read_yaml(folder / "args.yml"), "rounds": self.arguments.rounds,
                                          "n_timesteps": self.arguments.n_timesteps})  # fmt: skip

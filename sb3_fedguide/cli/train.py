@@ -5,8 +5,6 @@ Nothing is created on disk, and neither PyTorch nor the simulator is imported, b
 
 from __future__ import annotations
 
-import argparse
-import importlib.util
 import shlex
 import sys
 import threading
@@ -17,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_fedguide.cli.arguments import parse_train
-from sb3_fedguide.cli.gymnasium_ids import is_registered, registered_family
 from sb3_fedguide.cli.output import pipe_may_close
+from sb3_fedguide.cli.request import Request, check_tracker, find_family, resolve_request
 from sb3_fedguide.cli.resume import (
     check_length,
     finished_rounds,
@@ -30,19 +28,15 @@ from sb3_fedguide.cli.resume import (
 )
 from sb3_fedguide.cli.run import Run, one_message
 from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
-from sb3_fedguide.registry import ALGORITHMS
-from sb3_fedguide.settings.names import check_names
 from sb3_fedguide.settings.packages import import_packages
 
 if TYPE_CHECKING:
     from fed_envs import Family
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
-    from sb3_fedguide.settings.config import Config
 
 EXIT_INTERRUPTED = 130
 PACKAGE = Path(__file__).parents[1]
-ID_PREFIX, ID_SUFFIX = "fed_envs/", "-v0"
 
 
 @pipe_may_close
@@ -59,9 +53,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
             run = resume(Path(arguments.resume), given_flags(argv, prog), command, prog)
         else:
             import_packages(arguments.gym_packages)
-            family = find_family(arguments)
-            check_before_imports(arguments)
-            run = prepare(arguments, family, command)
+            run = prepare(resolve_request(arguments, find_family(arguments)), command)
     except (ValueError, OSError) as error:
         print(f"{prog}: error: {one_message(error)}", file=sys.stderr)
         return EXIT_USAGE
@@ -124,13 +116,16 @@ def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Call
     :param given: the flags on the command line
     :raises ValueError: where it cannot go on
     """
+    from sb3_fedguide.cli.delays import read_delays
+    from sb3_fedguide.cli.run_folder import exclusive
+
     arguments = read_arguments(folder, given, prog)
     check_tracker(arguments.track)
     import_packages(arguments.gym_packages)
-    config, family = read_settings(folder, arguments.algo)
-    config = with_length(config, family, given)
-    from sb3_fedguide.cli.run_folder import exclusive
-
+    before, family = read_settings(folder, arguments.algo)
+    config = with_length(before, family, given)
+    delays = None if arguments.delays is None else read_delays(arguments.delays)
+    request = Request(arguments, family, config, delays)
     with ExitStack() as stack:
         stack.enter_context(exclusive(folder))
         if (rounds := finished_rounds(folder)) is not None:
@@ -138,154 +133,48 @@ def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Call
             if config.n_rounds == rounds:
                 print(f"the run in {folder} is finished: it had its {rounds} rounds")
                 return lambda: 0
-        run = Run(arguments, command, config, family, make_model(arguments, config, family), folder)
+        run = Run(request, command, make_model(request), folder, longer=config != before)
         if load_checkpoint(folder, run.model.resume, prog):
             check_length(folder, config, run.model.round)
         run.lock = stack.pop_all()
     return run
 
 
-def find_family(arguments: argparse.Namespace) -> Family:
-    """The clients that ``--env`` or ``--metadata`` mean.
+def prepare(request: Request, command: str) -> Run:
+    """Construct the algorithm; nothing is written yet.
 
-    :raises ValueError: for an unknown family, a wrong file, or two that do not belong together
+    :raises ValueError: where the settings do not fit the environments or the data
     """
-    import fed_envs
-
-    named = None
-    if arguments.env is not None:
-        name = arguments.env
-        if name.startswith(ID_PREFIX) and name.endswith(ID_SUFFIX):
-            name = name[len(ID_PREFIX) : -len(ID_SUFFIX)]
-        ids = name.split(",")
-        if name in fed_envs.FAMILIES or not (len(ids) > 1 or is_registered(name) or arguments.client_kwargs):
-            check_names([name], fed_envs.FAMILIES, "environment")
-            named = fed_envs.load_family(name)
-        else:
-            named = registered_family(ids, arguments.client_kwargs, arguments.env_kwargs)
-    if (arguments.client_kwargs or arguments.env_kwargs) and (named is None or named.world != "gymnasium"):
-        raise ValueError("--client-kwargs and --env-kwargs are for the ids of registered environments, --env Pendulum-v1")
-    if arguments.metadata is None:
-        assert named is not None  # one of the two is required
-        return named
-    if not Path(arguments.metadata).is_file():
-        raise ValueError(f"--metadata: there is no file {arguments.metadata}")
-    family = fed_envs.load_family(Path(arguments.metadata).absolute())
-    if named is not None and named.backbone != family.backbone:
-        raise ValueError(
-            f"--env {named.name} and --metadata {arguments.metadata} do not belong together: the file's clients are "
-            f"{family.backbone}, not {named.backbone}; leave --env out to take the settings of the file's own family"
-        )
-    return family
-
-
-def check_before_imports(arguments: argparse.Namespace) -> None:
-    """What the flags and the files that they name already show, without PyTorch and the simulator.
-
-    :raises ValueError: for what is wrong
-    """
-    from sb3_fedguide.cli.delays import read_delays
-    from sb3_fedguide.cli.run_folder import check_log_folder, parameter_file
-    from sb3_fedguide.offline.cache import cache_folder, check_cache_folder
-    from sb3_fedguide.settings.config import config_path, parse_params, read_config
-
-    check_names([arguments.algo], ALGORITHMS, "algorithm")
-    if arguments.engine == "ray" and importlib.util.find_spec("ray") is None:
-        raise ValueError("--engine ray needs Ray: pip install 'sb3-fedguide[ray]'")
-    check_tracker(arguments.track)
-    check_log_folder(Path(arguments.log_folder))
-    if arguments.tensorboard_log is not None:
-        check_log_folder(Path(arguments.tensorboard_log))
-    check_cache_folder(cache_folder(arguments.cache_dir))
-    read_config(config_path(arguments.conf_file, arguments.algo))
-    parse_params(arguments.hyperparams)
-    if arguments.trained_agent is not None:
-        arguments.trained_agent = str(parameter_file(arguments.trained_agent))
-    if arguments.delays is not None:
-        arguments.delays = str(read_delays(arguments.delays))  # the run's own, should a file change
-
-
-def check_tracker(name: str | None) -> None:
-    """:raises ValueError: if the package that ``--track`` needs is missing"""
-    if name is not None and importlib.util.find_spec(name) is None:
-        raise ValueError(f"--track {name} needs the package {name}: pip install 'sb3-fedguide[{name}]'")
-
-
-def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Hyperparameters given on the command line, flags included.
-
-    :raises ValueError: where two of them say the same thing
-    """
-    from sb3_fedguide.settings.config import parse_params
-
-    given = parse_params(arguments.hyperparams)
-    flags = {
-        "n_rounds": ("--rounds", arguments.rounds),
-        "n_envs_per_client": ("--n-envs-per-client", arguments.n_envs_per_client),
-        "pretraining.dataset": ("--dataset", arguments.dataset),
-    }
-    for name, (flag, value) in flags.items():
-        if value is not None:
-            if name in given:
-                raise ValueError(f"{flag} and -params {name} set the same thing; give one of them")
-            given[name] = value
-    if arguments.n_timesteps is not None and "n_rounds" in given:
-        raise ValueError("-n/--n-timesteps and -params n_rounds both say how long to train; give one of them")
-    return given
-
-
-def settings_entry(arguments: argparse.Namespace) -> str | None:
-    """The entry of a configuration file that ``--env`` asks for; ``None`` for that of the family."""
-    return None if arguments.env is None else arguments.env.removeprefix(ID_PREFIX).removesuffix(ID_SUFFIX)
-
-
-def resolved(arguments: argparse.Namespace, family: Family) -> Config:
-    """The hyperparameters that the flags ask for.
-
-    :raises ValueError: for anything that a user can put right
-    """
-    from sb3_fedguide.settings.config import resolve
-
-    given, entry = overrides(arguments), settings_entry(arguments)
-    return resolve(arguments.algo, family, arguments.conf_file, entry, given, arguments.n_timesteps)
-
-
-def prepare(arguments: argparse.Namespace, family: Family, command: str) -> Run:
-    """Resolve the hyperparameters and construct the algorithm; nothing is written yet.
-
-    :raises ValueError: for anything that a user can put right
-    """
-    config = resolved(arguments, family)
-    if config.values["pretraining"]["dataset"] is not None:
-        _check_dataset(config.values["pretraining"]["dataset"], family)
-    model = make_model(arguments, config, family)
+    dataset = request.config.values["pretraining"]["dataset"]
+    if dataset is not None:
+        _check_dataset(dataset, request.family)
+    model = make_model(request)
     model.check_offline_data()
-    return Run(arguments, command, config, family, model)
+    return Run(request, command, model)
 
 
-def make_model(arguments: argparse.Namespace, config: Config, family: Family) -> FederatedPPO | FederatedDDPG:
+def make_model(request: Request) -> FederatedPPO | FederatedDDPG:
     """Construct the algorithm.
 
     :raises ValueError: where the settings do not fit together
     """
     import torch as th
 
-    from sb3_fedguide.cli.delays import read_delays
-
+    arguments = request.arguments
     _check_device(arguments.device)
     th.set_num_threads(1)
-    model = config.make(
-        family,
+    model = request.config.make(
+        request.family,
         seed=arguments.seed if arguments.seed >= 0 else None,
         device=arguments.device,
         num_threads=arguments.num_threads,
         cache_dir=arguments.cache_dir,
         verbose=0,
     )
-    if arguments.delays is not None:
+    if request.delays is not None:
         from sb3_fedguide.common.participation import simulate_delays
 
-        simulate_delays(model, read_delays(arguments.delays))
+        simulate_delays(model, request.delays)
     if arguments.trained_agent is not None:
         model.import_parameters(arguments.trained_agent)
     return model

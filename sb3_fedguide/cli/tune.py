@@ -17,14 +17,9 @@ from typing import TYPE_CHECKING, Any
 from sb3_fedguide.cli.arguments import parse_train
 from sb3_fedguide.cli.benchmark_arguments import train_flags
 from sb3_fedguide.cli.output import pipe_may_close
+from sb3_fedguide.cli.request import find_family, resolve_request
 from sb3_fedguide.cli.run import one_message
-from sb3_fedguide.cli.train import (
-    EXIT_INTERRUPTED,
-    check_before_imports,
-    find_family,
-    overrides,
-    prepare,
-)
+from sb3_fedguide.cli.train import EXIT_INTERRUPTED, prepare
 from sb3_fedguide.cli.tune_arguments import N_TRIALS, PASSED_ON, SETTINGS, parse_tune
 from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 from sb3_fedguide.registry import ALGORITHMS
@@ -77,7 +72,8 @@ class Tuning:
 
         :raises ValueError: for settings that the algorithm refuses
         """
-        return prepare(parse_train([*self.train_flags(settings), "-f", str(self.folder)], self.prog), self.family, "").config
+        arguments = parse_train([*self.train_flags(settings), "-f", str(self.folder)], self.prog)
+        return prepare(resolve_request(arguments, self.family), "").config
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -136,8 +132,8 @@ def plan(arguments: argparse.Namespace, prog: str) -> Tuning:
     flags = train_flags(arguments, SETTINGS + PASSED_ON)
     parsed = parse_train([*flags, "-f", arguments.folder], prog)
     family = find_family(parsed)
-    check_before_imports(parsed)
-    fixed = overrides(parsed)
+    request = resolve_request(parsed, family)
+    fixed = request.overrides
     space = read_space(Path(arguments.search), fixed) if arguments.search else default_space(arguments.algo, fixed)
     n_trials = arguments.n_trials or N_TRIALS
     if arguments.sampler == "grid":
@@ -147,7 +143,7 @@ def plan(arguments: argparse.Namespace, prog: str) -> Tuning:
     folder = Path(arguments.folder).absolute() / name
     storage = Path(arguments.storage).absolute() if arguments.storage else folder / "study.db"
     check_log_folder(storage.parent)
-    config = prepare(parsed, family, "").config
+    config = prepare(request, "").config
     tuning = Tuning(arguments, prog, flags, family, config, space, n_trials, name, folder, storage)
     for settings in space.probes():
         try:

@@ -10,8 +10,8 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from sb3_fedguide.cli.request import settings_entry
 from sb3_fedguide.cli.run_folder import write_text
-from sb3_fedguide.cli.train import settings_entry
 
 if TYPE_CHECKING:
     import optuna
@@ -43,7 +43,7 @@ def conclude(tuning: Tuning, study: optuna.Study) -> None:
     console.print(title, highlight=False, soft_wrap=True)  # as a table's title it would wrap at the table's width
     console.print(table)
     settings = {name: _plain(best[0].params[name]) for name in tuning.space.entries}
-    entry = settings_entry(tuning.arguments) or tuning.family.name
+    entry = settings_entry(tuning.arguments.env) or tuning.family.name
     text = yaml.safe_dump({entry: tuning.resolve(settings).values}, sort_keys=False, default_flow_style=None)
     path = tuning.folder / "best.yml"
     write_text(path, f"# {title}; trial {best[0].number}, F {best[0].values[0]:.6g}\n{text}")

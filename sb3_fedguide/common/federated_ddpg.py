@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,28 +12,26 @@ import torch as th
 from stable_baselines3 import DDPG
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from fed_envs import FederatedVecEnv
 from fed_envs.state import State
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy, check_ddpg_actions
 from sb3_fedguide.common.ddpg_settings import check_settings
-from sb3_fedguide.common.environments import FederationLike, as_federated_env
+from sb3_fedguide.common.environments import as_federated_env
 from sb3_fedguide.common.faults import check_experience
 from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.common.keywords import check_policy, check_policy_keywords
 from sb3_fedguide.common.noise import OrnsteinUhlenbeckNoise
-from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
+from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.replay_buffer import FederatedReplayBuffer
 from sb3_fedguide.common.training_log import RoundStatistics
-from sb3_fedguide.offline.pretraining import Pretraining, PretrainingConfig
+from sb3_fedguide.offline.pretraining import Pretraining
 from sb3_fedguide.seeding import Role, integer_seed
-from sb3_fedguide.server.validation import UPLOAD_BOUND
-from sb3_fedguide.settings.networks import DeterministicNetworkConfig, NetworkConfig
-from sb3_fedguide.settings.ranges import check_ranges
+from sb3_fedguide.settings.arguments import FederatedDDPGArguments
+from sb3_fedguide.settings.ranges import check_values
+from sb3_fedguide.settings.signatures import takes, types_of
 
 
 class FederatedDDPG(Federation, DDPG):
@@ -79,8 +76,7 @@ class FederatedDDPG(Federation, DDPG):
     :raises ValueError: for settings that do not fit, with the remedy in the message
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": StackedDDPGPolicy}
-    network_config: ClassVar[type[NetworkConfig]] = DeterministicNetworkConfig
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(FederatedDDPGArguments.policies, StackedDDPGPolicy)
     #: whose settings an algorithm of the user's own starts from, where it has none
     base_settings: ClassVar[str | None] = None
     replay_buffer: FederatedReplayBuffer | None  # type: ignore[assignment]
@@ -88,75 +84,43 @@ class FederatedDDPG(Federation, DDPG):
     train_freq: int
     state_attributes: ClassVar[tuple[str, ...]] = ("client_steps",)
 
-    def __init__(
-        self,
-        policy: str | type[TD3Policy],
-        env: FederationLike | None,
-        learning_rate: float | Schedule = 1e-4,
-        rollout_size: int = 4096,
-        buffer_size: int = 100_000,
-        learning_starts: int = 1000,
-        batch_size: int = 64,
-        tau: float = 1e-3,
-        gamma: float = 0.99,
-        train_freq: int = 1,
-        gradient_steps: int = 1,
-        noise_theta: float = 0.15,
-        noise_sigma: float = 0.2,
-        noise_dt: float = 1.0,
-        n_envs_per_client: int = 1,
-        clients: Sequence[int] | None = None,
-        num_threads: int = 1,
-        normalize: Normalize = False,
-        bc_weight: float = 0.0,
-        client_fraction: float = 1.0,
-        upload_bound: float | None = UPLOAD_BOUND,
-        pretraining: PretrainingConfig | dict[str, Any] | None = None,
-        cache_dir: str | Path | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "cpu",
-        _init_setup_model: bool = True,
-    ) -> None:
-        check_ranges(locals())
-        check_policy(policy, self.policy_aliases, type(self))
-        env = as_federated_env(env, n_envs_per_client, clients, num_threads)
-        self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
+    @takes(FederatedDDPGArguments)
+    def __init__(self, given: FederatedDDPGArguments) -> None:
+        check_policy(given.policy, self.policy_aliases, type(self))
+        env = as_federated_env(given.env, given.n_envs_per_client, given.clients, given.num_threads)
+        self._init_federation(env, given)
         if env is not None:
             check_ddpg_actions(env.action_space)
-        self.rollout_size = rollout_size
-        self.noise_theta, self.noise_sigma, self.noise_dt = noise_theta, noise_sigma, noise_dt
+        self.rollout_size = given.rollout_size
+        self.noise_theta, self.noise_sigma, self.noise_dt = given.noise_theta, given.noise_sigma, given.noise_dt
         #: steps that each client has taken in its life, ``(n_clients,)``
         self.client_steps = np.zeros(self.n_clients, dtype=int)
         super().__init__(
-            policy,
+            given.policy,  # type: ignore[arg-type]
             env,  # type: ignore[arg-type]
-            learning_rate=learning_rate,
-            buffer_size=buffer_size,
-            learning_starts=learning_starts,
-            batch_size=batch_size,
-            tau=tau,
-            gamma=gamma,
-            train_freq=train_freq,
-            gradient_steps=gradient_steps,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=dict(policy_kwargs or {}),  # SB3 adds to it
-            verbose=verbose,
-            seed=int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else seed,
-            device=device,
+            learning_rate=given.learning_rate,
+            buffer_size=given.buffer_size,
+            learning_starts=given.learning_starts,
+            batch_size=given.batch_size,
+            tau=given.tau,
+            gamma=given.gamma,
+            train_freq=given.train_freq,
+            gradient_steps=given.gradient_steps,
+            tensorboard_log=given.tensorboard_log,
+            policy_kwargs=dict(given.policy_kwargs or {}),  # SB3 adds to it
+            verbose=given.verbose,
+            seed=int(np.random.SeedSequence().generate_state(1)[0] >> 1) if given.seed is None else given.seed,
+            device=given.device,
             _init_setup_model=False,
         )
-        self._stats_window_size = stats_window_size
+        self._stats_window_size = given.stats_window_size
         check_settings(self)
-        if _init_setup_model:
+        if given._init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
         assert self.seed is not None
-        check_ranges(vars(self))  # those of subclasses, and of load()
+        check_values(types_of(type(self)), vars(self))  # those of subclasses, and of load()
         check_policy_keywords(self.policy_class, self.policy_kwargs)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
@@ -315,7 +279,7 @@ class FederatedDDPG(Federation, DDPG):
                 self.note_episode(int(client), info)
         return next_obs, terminations
 
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+    def train(self, gradient_steps: int, batch_size: int = FederatedDDPGArguments.batch_size) -> None:
         """SB3's DDPG update for all clients at once; their losses are summed, so that no gradient mixes two clients."""
         assert self.replay_buffer is not None
         actor_parameters = self.policy.actor_parameters

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,20 +16,19 @@ from stable_baselines3.common.utils import FloatSchedule
 
 from fed_envs import FederatedVecEnv
 from sb3_fedguide.common.distributions import action_distribution, check_continuous
-from sb3_fedguide.common.environments import FederationLike, as_federated_env
+from sb3_fedguide.common.environments import as_federated_env
 from sb3_fedguide.common.faults import check_experience
-from sb3_fedguide.common.federation import Federation, PolicyLike
+from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.common.keywords import check_policy, check_policy_keywords
-from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize
+from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
 from sb3_fedguide.common.rollout_buffer import FederatedRolloutBuffer, FederatedSamples, check_sizes, generalized_advantage
 from sb3_fedguide.common.training_log import RoundStatistics, record_training
-from sb3_fedguide.offline.pretraining import PretrainingConfig
 from sb3_fedguide.seeding import Role, integer_seed
-from sb3_fedguide.server.validation import UPLOAD_BOUND
-from sb3_fedguide.settings.networks import NetworkConfig, StochasticNetworkConfig
-from sb3_fedguide.settings.ranges import check_ranges
+from sb3_fedguide.settings.arguments import FederatedPPOArguments
+from sb3_fedguide.settings.ranges import check_values
+from sb3_fedguide.settings.signatures import takes, types_of
 from sb3_fedguide.state.stacked import clip_grad_norm_per_client
 
 
@@ -73,81 +70,48 @@ class FederatedPPO(Federation, PPO):
     :raises ValueError: for settings that do not fit, with the remedy in the message
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": StackedMlpPolicy}
-    network_config: ClassVar[type[NetworkConfig]] = StochasticNetworkConfig
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(FederatedPPOArguments.policies, StackedMlpPolicy)
     #: whose settings an algorithm of the user's own starts from, where it has none
     base_settings: ClassVar[str | None] = "local"
     rollout_buffer: FederatedRolloutBuffer  # type: ignore[assignment]
     policy: StackedMlpPolicy
 
-    def __init__(
-        self,
-        policy: PolicyLike,
-        env: FederationLike | None,
-        learning_rate: float | Schedule = 3e-4,
-        rollout_size: int = 4096,
-        batch_size: int = 64,
-        n_epochs: int = 4,
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
-        clip_range: float | Schedule = 0.2,
-        clip_range_vf: float | Schedule | None = None,
-        normalize_advantage: bool = True,
-        ent_coef: float = 0.0,
-        vf_coef: float = 0.5,
-        max_grad_norm: float = 0.5,
-        n_envs_per_client: int = 1,
-        clients: Sequence[int] | None = None,
-        num_threads: int = 1,
-        normalize: Normalize = False,
-        bc_weight: float = 0.0,
-        client_fraction: float = 1.0,
-        upload_bound: float | None = UPLOAD_BOUND,
-        pretraining: PretrainingConfig | dict[str, Any] | None = None,
-        cache_dir: str | Path | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "cpu",
-        _init_setup_model: bool = True,
-    ) -> None:
-        check_ranges(locals())
-        check_policy(policy, self.policy_aliases, type(self))
-        env = as_federated_env(env, n_envs_per_client, clients, num_threads)
-        self._init_federation(env, normalize, bc_weight, pretraining, cache_dir, client_fraction, upload_bound)
-        check_sizes(rollout_size, batch_size, self.n_envs_per_client)
+    @takes(FederatedPPOArguments)
+    def __init__(self, given: FederatedPPOArguments) -> None:
+        check_policy(given.policy, self.policy_aliases, type(self))
+        env = as_federated_env(given.env, given.n_envs_per_client, given.clients, given.num_threads)
+        self._init_federation(env, given)
+        check_sizes(given.rollout_size, given.batch_size, self.n_envs_per_client)
         if env is not None:
             self._check_actions(env)
-        self.rollout_size = rollout_size
+        self.rollout_size = given.rollout_size
         with warnings.catch_warnings():
             # SB3 takes the clients' rollouts for one and compares its size with a client's minibatch.
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             super().__init__(
-                policy,
+                given.policy,  # type: ignore[arg-type]
                 env,  # type: ignore[arg-type]
-                learning_rate=learning_rate,
-                n_steps=rollout_size // self.n_envs_per_client,
-                batch_size=batch_size,
-                n_epochs=n_epochs,
-                gamma=gamma,
-                gae_lambda=gae_lambda,
-                clip_range=clip_range,
-                clip_range_vf=clip_range_vf,
-                normalize_advantage=normalize_advantage,
-                ent_coef=ent_coef,
-                vf_coef=vf_coef,
-                max_grad_norm=max_grad_norm,
-                stats_window_size=stats_window_size,
-                tensorboard_log=tensorboard_log,
-                policy_kwargs=policy_kwargs,
-                verbose=verbose,
-                seed=int(np.random.SeedSequence().generate_state(1)[0] >> 1) if seed is None else seed,
-                device=device,
+                learning_rate=given.learning_rate,
+                n_steps=given.rollout_size // self.n_envs_per_client,
+                batch_size=given.batch_size,
+                n_epochs=given.n_epochs,
+                gamma=given.gamma,
+                gae_lambda=given.gae_lambda,
+                clip_range=given.clip_range,
+                clip_range_vf=given.clip_range_vf,
+                normalize_advantage=given.normalize_advantage,
+                ent_coef=given.ent_coef,
+                vf_coef=given.vf_coef,
+                max_grad_norm=given.max_grad_norm,
+                stats_window_size=given.stats_window_size,
+                tensorboard_log=given.tensorboard_log,
+                policy_kwargs=given.policy_kwargs,
+                verbose=given.verbose,
+                seed=int(np.random.SeedSequence().generate_state(1)[0] >> 1) if given.seed is None else given.seed,
+                device=given.device,
                 _init_setup_model=False,
             )
-        if _init_setup_model:
+        if given._init_setup_model:
             self._setup_model()
 
     def _check_actions(self, env: FederatedVecEnv) -> None:
@@ -161,7 +125,7 @@ class FederatedPPO(Federation, PPO):
 
     def _setup_model(self) -> None:
         assert self.seed is not None
-        check_ranges(vars(self))  # those of subclasses, and of load()
+        check_values(types_of(type(self)), vars(self))  # those of subclasses, and of load()
         check_policy_keywords(self.policy_class, self.policy_kwargs)
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch as th
@@ -23,7 +22,7 @@ from sb3_fedguide.common.episodes import EpisodeStatistics
 from sb3_fedguide.common.exchange import Exchange
 from sb3_fedguide.common.faults import check_policies, in_round, warn_of_new_episodes
 from sb3_fedguide.common.keywords import CheckedKeywords
-from sb3_fedguide.common.normalization import FederatedNormalizer, Normalize, check_normalize
+from sb3_fedguide.common.normalization import FederatedNormalizer, check_normalize
 from sb3_fedguide.common.parameters import ParameterFiles
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
@@ -33,7 +32,7 @@ from sb3_fedguide.offline.pretraining import PretrainingConfig
 from sb3_fedguide.seeding import Role, stream
 from sb3_fedguide.server.participants import draw_participants
 from sb3_fedguide.server.strategy import Strategy
-from sb3_fedguide.server.validation import UPLOAD_BOUND
+from sb3_fedguide.settings.arguments import FederationArguments
 from sb3_fedguide.settings.participants import n_participants
 
 if TYPE_CHECKING:
@@ -55,28 +54,19 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
     rollout_size: int
     gamma: float
 
-    def _init_federation(
-        self,
-        env: FederatedVecEnv | None,
-        normalize: Normalize,
-        bc_weight: float,
-        pretraining: PretrainingConfig | dict[str, Any] | None,
-        cache_dir: str | Path | None,
-        client_fraction: float = 1.0,
-        upload_bound: float | None = UPLOAD_BOUND,
-    ) -> None:
+    def _init_federation(self, env: FederatedVecEnv | None, given: FederationArguments) -> None:
         """Called by a subclass's constructor, before SB3's."""
-        check_normalize(normalize)
+        check_normalize(given.normalize)
         self.client_ids: list[int] = [] if env is None else list(env.client_ids)
         self.n_envs_per_client = 1 if env is None else env.n_envs_per_client
         self.family = None if env is None else env.family
         self.raw_observation_space = None if env is None else env.raw_observation_space
-        self.normalize = normalize
-        self.bc_weight = bc_weight
-        self.pretraining_config = PretrainingConfig.model_validate(pretraining or {})
-        self.cache_dir = cache_dir
-        self.client_fraction = client_fraction
-        self.upload_bound = upload_bound
+        self.normalize = given.normalize
+        self.bc_weight = given.bc_weight
+        self.pretraining_config = PretrainingConfig.model_validate(given.pretraining or {})
+        self.cache_dir = given.cache_dir
+        self.client_fraction = given.client_fraction
+        self.upload_bound = given.upload_bound
         #: environment steps that one step of a round counts; by default those of the clients that take part here
         self.steps_at_once: int | None = None
         #: what trains the clients in other processes; here if ``None``

@@ -11,7 +11,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_fedguide.common.stacked_policy import StackedPolicy
-from sb3_fedguide.settings.signatures import CompleteSignature, parameters
+from sb3_fedguide.settings.ranges import check_values
+from sb3_fedguide.settings.signatures import CompleteSignature, parameters, types_of
 
 _NO_SDE = "exploration noise is drawn by each client's own random stream, independently in every step"
 _NO_FEATURES = "lockstep policies see flat observations as they are; extract features in a wrapper around the environments"
@@ -104,10 +105,12 @@ def _refuse(name: str, known: set[str], where: str, reasons: Mapping[str, str] =
 
 
 class CheckedKeywords(BaseAlgorithm):
-    """Mixin: keywords are checked before any constructor runs, and the signature shows all of them."""
+    """Mixin: names and values are checked before any constructor runs, and the signature shows all names."""
 
     __signature__ = CompleteSignature()
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         check_keywords(cls, kwargs)
+        types = types_of(cls)
+        check_values(types, {**dict(zip(types, args, strict=False)), **kwargs})
         return super().__new__(cls)

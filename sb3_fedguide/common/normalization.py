@@ -8,15 +8,12 @@ wrapper, so that ``predict``, ``save`` and ``client(k)`` take raw observations, 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
 import torch as th
 
 from sb3_fedguide.server.payload import OBSERVATION_COUNT, OBSERVATION_MEAN, OBSERVATION_VAR, Payload
-
-#: Nothing, statistics per client, or observation statistics that all clients share.
-Normalize = bool | Literal["shared"]
+from sb3_fedguide.settings.arguments import Normalize as Normalize
 
 
 def check_normalize(normalize: Normalize) -> None:

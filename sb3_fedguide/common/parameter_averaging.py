@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, Unpack
+from typing import Any, ClassVar
 
 import numpy as np
-from stable_baselines3.common.type_aliases import Schedule
 
 from sb3_fedguide.common.anchors import Parameters, snapshot
-from sb3_fedguide.common.arguments import LearnerArguments
-from sb3_fedguide.common.federation import Federation, FederationLike
+from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.common.screening import Screening, check_screening
 from sb3_fedguide.common.upload_privacy import UploadPrivacy
-from sb3_fedguide.server.averaging import (
-    Aggregator,
-    averaged_prefixes,
-    averaging_is_due,
-    check_aggregator,
-    check_averaging,
-    policy_is_due,
-)
+from sb3_fedguide.server.averaging import averaged_prefixes, averaging_is_due, policy_is_due
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload
+from sb3_fedguide.settings.arguments import AveragingArguments
+from sb3_fedguide.settings.signatures import adds
 
 
 class ParameterAveraging(Federation):
@@ -53,51 +46,31 @@ class ParameterAveraging(Federation):
 
     state_attributes: ClassVar[tuple[str, ...]] = ("screening_state", "privacy_state", "known_parameters")
 
-    def __init__(
-        self,
-        policy: Any,
-        env: FederationLike | None,
-        average: Literal["all", "actor", "critic"] = "all",
-        average_every: int = 1,
-        average_until: int | None = None,
-        aggregator: Aggregator = "mean",
-        trim_fraction: float = 0.25,
-        server_step: float | Literal["exp"] = 1.0,
-        server_momentum: float = 0.0,
-        mix: float | Schedule = 1.0,
-        screening: float = 0.0,
-        noise_multiplier: float = 0.0,
-        clipping_norm: float | None = None,
-        delta: float = 1e-5,
-        **learner: Unpack[LearnerArguments],
-    ) -> None:
-        check_averaging(average, average_every)
-        check_aggregator(aggregator, trim_fraction)
-        check_screening(screening, average)
-        if not callable(mix) and not 0 <= mix <= 1:
-            raise ValueError(f"mix={mix} must lie in [0, 1]: it is the share of what the server sends that a client takes")
-        self.average: Literal["all", "actor", "critic"] = average
-        self.average_every = average_every
-        self.average_until = average_until
-        self.aggregator = aggregator
-        self.trim_fraction = trim_fraction
-        self.server_step = server_step
-        self.server_momentum = server_momentum
-        self.mix = mix
-        self.screening = screening
+    @adds(AveragingArguments)
+    def __init__(self, given: AveragingArguments, *args: Any, **learner: Any) -> None:
+        check_screening(given.screening, given.average)
+        self.average = given.average
+        self.average_every = given.average_every
+        self.average_until = given.average_until
+        self.aggregator = given.aggregator
+        self.trim_fraction = given.trim_fraction
+        self.server_step = given.server_step
+        self.server_momentum = given.server_momentum
+        self.mix = given.mix
+        self.screening = given.screening
         #: see :attr:`Screening.state`; empty until the first test or without tests
         self.screening_state: dict[str, np.ndarray] = {}
         self._tests = Screening(self)
-        self.noise_multiplier = noise_multiplier
-        self.clipping_norm = clipping_norm
-        self.delta = delta
+        self.noise_multiplier = given.noise_multiplier
+        self.clipping_norm = given.clipping_norm
+        self.delta = given.delta
         #: see :meth:`UploadPrivacy.begin`; empty without
         self.privacy_state: dict[str, np.ndarray] = {}
         #: what the server knows of what each client uploads, ``(n_clients, ...)`` each; empty without clipping
         self.known_parameters: Parameters = {}
         self._privacy = UploadPrivacy(self)
         self._shares: dict[int, float] = {}
-        super().__init__(policy, env, **learner)  # type: ignore[arg-type, misc]
+        super().__init__(*args, **learner)
 
     def _setup_model(self) -> None:
         super()._setup_model()  # type: ignore[safe-super]  # the learner's

@@ -14,11 +14,9 @@ from sb3_fedguide.deployment.config import ServerConfig
 from sb3_fedguide.deployment.flower.certificates import CA, SERVER, SERVER_KEY, read_public_key
 from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.server.methods import COMMON, find_method, make_strategy
-from sb3_fedguide.settings.config import CONFIGURATIONS, DEFAULT, config_path, read_config, read_yaml
+from sb3_fedguide.settings.arguments import FederationArguments
+from sb3_fedguide.settings.config import CONFIGURATIONS, DEFAULT, complete, layers, read_yaml
 from sb3_fedguide.settings.names import check_names
-
-#: Default of every algorithm's constructor, which a server without PyTorch cannot ask.
-ROLLOUT_SIZE = 4096
 
 
 class _File(pydantic.BaseModel):
@@ -100,19 +98,18 @@ class ServerDeployment:
             raise ValueError(f"{path}: clients are numbered from 0 to {len(self.clients) - 1}, not {sorted(self.clients)}")
         if len(self.keys) < len(self.clients):
             raise ValueError(f"{path}: two clients have the same key; every client has a key of its own")
-        settings = _settings(file, base)
-        given = {name: settings[name] for name in (*COMMON, *find_method(file.algo).defaults) if name in settings}
         limits = {name: getattr(file, name) for name in ("timeout", "setup_timeout", "start_clients", "min_clients", "wait")}
-        rollout_size = settings.get("rollout_size", ROLLOUT_SIZE)
         try:
-            self.server = ServerConfig(
-                file.algo, len(self.clients), _rounds(file, settings), rollout_size, file.seed, given, **limits
-            )
-            make_strategy(file.algo, given, len(self.clients), file.seed)
+            settings = _settings(file, base)
+            given = {name: settings[name] for name in (*COMMON, *find_method(file.algo).defaults) if name in settings}
+            rollout_size = settings.get("rollout_size", FederationArguments.rollout_size)
+            n_clients, n_rounds = len(self.clients), settings["n_rounds"]
+            self.server = ServerConfig(file.algo, n_clients, n_rounds, rollout_size, file.seed, given, **limits)
+            make_strategy(file.algo, given, n_clients, file.seed)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         except TypeError as error:
-            raise ValueError(f"{path}: one of the settings {given} has the wrong type: {error}") from None
+            raise ValueError(f"{path}: one of the settings has the wrong type: {error}") from None
 
     def process_settings(self) -> dict[str, Any]:
         """What the process of the round loop reads."""
@@ -154,17 +151,19 @@ def _conf(conf: str, base: Path) -> str:
 
 
 def _settings(file: ServerFile, base: Path) -> dict[str, Any]:
-    """What the clients' settings are made of, as far as it is not nested."""
+    """What the clients' settings are made of. They are checked, but for an algorithm whose class would be needed for that.
+
+    :raises ValueError: for what is wrong
+    """
     check_names([file.algo], ALGORITHMS, "algorithm")
-    content = read_config(config_path(_conf(file.conf, base), file.algo))
-    return {**content.get(DEFAULT, {}), **content.get(file.env, {}), **file.params}
-
-
-def _rounds(file: ServerFile, settings: Mapping[str, Any]) -> int:
-    n_rounds = settings.get("n_rounds") if file.n_rounds is None else file.n_rounds
-    if n_rounds is None:
+    own = ALGORITHMS[file.algo].arguments is None
+    rounds = {} if file.n_rounds is None else {"n_rounds": file.n_rounds}
+    merged = layers(file.algo, _conf(file.conf, base), (file.env,), {**file.params, **rounds}, check=not own)[2]
+    if "n_rounds" not in merged:
         raise ValueError("the number of rounds is missing; give n_rounds")
-    return n_rounds
+    if not own:
+        complete(merged, file.algo)
+    return merged
 
 
 def _mapping(path: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from torch import nn
 
 from sb3_fedguide.offline.groups import client_groups, train_together
 from sb3_fedguide.offline.progress import StepProgress
+from sb3_fedguide.settings.pretraining import DEFAULTS
 
 __all__ = ["clone"]
 
@@ -22,9 +23,9 @@ def clone(
     observations: Sequence[np.ndarray],
     actions: Sequence[np.ndarray],
     rngs: Sequence[np.random.Generator],
-    n_updates: int = 2000,
-    batch_size: int = 512,
-    learning_rate: float = 3e-4,
+    n_updates: int = DEFAULTS.bc_updates,
+    batch_size: int = DEFAULTS.bc_batch_size,
+    learning_rate: float = DEFAULTS.bc_learning_rate,
     progress: StepProgress | None = None,
 ) -> np.ndarray:
     """Fit the mean actions to the data by least squares, in place; a client's result does not depend on the others.

@@ -24,6 +24,7 @@ from sb3_fedguide.offline.conjugates import conjugate
 from sb3_fedguide.offline.data import OfflineData
 from sb3_fedguide.offline.groups import client_groups, train_together
 from sb3_fedguide.offline.progress import StepProgress
+from sb3_fedguide.settings.pretraining import DEFAULTS
 
 __all__ = ["DiceValue", "calibrate", "train_dice"]
 
@@ -94,7 +95,7 @@ class DiceValue(nn.Module):
     offset: th.Tensor
     scale: th.Tensor
 
-    def __init__(self, n_clients: int, obs_dim: int, width: int = 256) -> None:
+    def __init__(self, n_clients: int, obs_dim: int, width: int = DEFAULTS.dice_width) -> None:
         super().__init__()
         self.n_clients, self.obs_dim, self.width = n_clients, obs_dim, width
         self.net = StackedMlp(n_clients, obs_dim, width)
@@ -131,15 +132,15 @@ class DiceValue(nn.Module):
 def train_dice(
     datasets: Sequence[OfflineData],
     rngs: Sequence[np.random.Generator],
-    n_updates: int = 5000,
-    batch_size: int = 128,
-    width: int = 256,
-    omega: float = 0.5,
-    learning_rate: float = 1e-4,
-    gamma: float = 0.99,
-    tau: float = 0.005,
-    f: str = "soft_chi",
-    v_coef: float | Literal["1-gamma"] = 1.0,
+    n_updates: int = DEFAULTS.dice_updates,
+    batch_size: int = DEFAULTS.dice_batch_size,
+    width: int = DEFAULTS.dice_width,
+    omega: float = DEFAULTS.dice_omega,
+    learning_rate: float = DEFAULTS.dice_learning_rate,
+    gamma: float = DEFAULTS.gamma,
+    tau: float = DEFAULTS.dice_tau,
+    f: str = DEFAULTS.dice_f,
+    v_coef: float | Literal["1-gamma"] = DEFAULTS.dice_v_coef,
     progress: StepProgress | None = None,
 ) -> DiceValue:
     """Train V and the twin Q of every client on its own data; a client's result does not depend on the others.

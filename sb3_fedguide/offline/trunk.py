@@ -25,6 +25,7 @@ from sb3_fedguide.priors.diffusion import DiffusionPrior
 from sb3_fedguide.priors.trunk_network import DiffusionTrunk
 from sb3_fedguide.server.averaging import weighted_average
 from sb3_fedguide.server.trunk import merge_moments
+from sb3_fedguide.settings.pretraining import DEFAULTS
 from sb3_fedguide.state.optimizer_state import load_optimizer, optimizer_state
 from sb3_fedguide.state.stacked import StackedLinear, client_state, stack_module, to_arrays, to_tensors
 
@@ -99,8 +100,8 @@ class TrunkTraining:
         datasets: Sequence[ActionData],
         rngs: Sequence[np.random.Generator],
         n_updates: int,
-        batch_size: int = 128,
-        learning_rate: float = 5e-3,
+        batch_size: int = DEFAULTS.prior_batch_size,
+        learning_rate: float = DEFAULTS.prior_learning_rate,
     ) -> None:
         if len(datasets) == 0 or len(rngs) != len(datasets):
             raise ValueError(f"Trunk training needs one random generator per dataset, got {len(rngs)} for {len(datasets)}.")
@@ -190,10 +191,10 @@ def federated_trunk(
     prior: DiffusionPrior,
     datasets: Sequence[ActionData],
     rngs: Sequence[np.random.Generator],
-    n_updates: int = 5000,
-    average_every: int = 50,
-    batch_size: int = 128,
-    learning_rate: float = 5e-3,
+    n_updates: int = DEFAULTS.prior_updates,
+    average_every: int = DEFAULTS.prior_average_every,
+    batch_size: int = DEFAULTS.prior_batch_size,
+    learning_rate: float = DEFAULTS.prior_learning_rate,
     progress: StepProgress | None = None,
 ) -> TrunkResult:
     """Pretrain the trunk of ``prior`` by FedAvg over the clients, all in this process.

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from sb3_fedguide.priors.base import HeadStatistics, Prior
 from sb3_fedguide.priors.density import flow_sample, ode_log_density, training_angle, uniform_step_angle
 from sb3_fedguide.priors.trunk_network import DiffusionTrunk
+from sb3_fedguide.settings.pretraining import DEFAULTS
 
 OBS_CLIP = 10.0  # standardised observations beyond this are as far out as it gets
 CHUNK_ROWS = 1024  # keeps the activations of one pass in the processor's cache
@@ -45,7 +46,7 @@ class DiffusionPrior(Prior):
         self,
         obs_dim: int,
         action_dim: int,
-        width: int = 64,
+        width: int = DEFAULTS.prior_width,
         encoder_width: int = 128,
         n_blocks: int = 2,
         n_frequencies: int = 4,

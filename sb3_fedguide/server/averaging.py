@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal, get_args
 
 import numpy as np
 
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload, Strategy
-
-#: What can take the place of the average, see :func:`combine`.
-Aggregator = Literal["mean", "median", "trimmed_mean"]
-AGGREGATORS: tuple[Aggregator, ...] = get_args(Aggregator)
+from sb3_fedguide.settings.arguments import Aggregator, Average, AveragingArguments, ServerStep
+from sb3_fedguide.settings.ranges import check_values
+from sb3_fedguide.settings.signatures import types_of
 
 
 def weighted_average(parts: Sequence[Mapping[str, np.ndarray]], counts: Sequence[float], names: Iterable[str]) -> Payload:
@@ -90,41 +87,12 @@ def policy_is_due(round: int, average: str, every: int, until: int | None = None
     return average != "critic" and averaging_is_due(round, every, until)
 
 
-AVERAGE_CHOICES = ("all", "actor", "critic")
-
-
-def averaged_prefixes(average: str, actor: tuple[str, ...], critic: tuple[str, ...]) -> tuple[str, ...]:
+def averaged_prefixes(average: Average, actor: tuple[str, ...], critic: tuple[str, ...]) -> tuple[str, ...]:
     """How the names of the parameters begin that are averaged.
 
-    :param average: one of :data:`AVERAGE_CHOICES`
+    :param average: which of them
     """
     return {"all": actor + critic, "actor": actor, "critic": critic}[average]
-
-
-def check_averaging(average: str, average_every: int) -> None:
-    """:raises ValueError: for an unknown choice, or a number of rounds below one"""
-    if average not in AVERAGE_CHOICES:
-        raise ValueError(f"average={average!r} must be one of {', '.join(AVERAGE_CHOICES)}")
-    if average_every < 1:
-        raise ValueError(f"average_every={average_every} must be at least 1 round")
-
-
-def check_aggregator(aggregator: str, trim_fraction: float) -> None:
-    """:raises ValueError: for an unknown aggregator, or a fraction that leaves nothing"""
-    if aggregator not in AGGREGATORS:
-        raise ValueError(f"aggregator={aggregator!r} must be one of {', '.join(AGGREGATORS)}")
-    if not 0 <= trim_fraction < 0.5:
-        raise ValueError(f"trim_fraction={trim_fraction} must lie in [0, 0.5): so much is left out on either side")
-
-
-def check_server_step(server_step: float | str, server_momentum: float) -> None:
-    """:raises ValueError: for a step that is neither positive nor ``"exp"``, or a momentum outside [0, 1)"""
-    if server_step != "exp" and (isinstance(server_step, str) or not 0 < server_step < math.inf):
-        raise ValueError(
-            f"server_step={server_step!r} must be a positive number, or 'exp' for FedExP's; 1 is the average itself"
-        )
-    if not 0 <= server_momentum < 1:
-        raise ValueError(f"server_momentum={server_momentum} must lie in [0, 1): it is what is kept of the last update")
 
 
 class Averaging(Strategy):
@@ -149,16 +117,15 @@ class Averaging(Strategy):
     def __init__(
         self,
         prefixes: tuple[str, ...] = ("",),
-        average_every: int = 1,
-        average_until: int | None = None,
-        aggregator: Aggregator = "mean",
-        trim_fraction: float = 0.25,
-        server_step: float | Literal["exp"] = 1.0,
-        server_momentum: float = 0.0,
+        average_every: int = AveragingArguments.average_every,
+        average_until: int | None = AveragingArguments.average_until,
+        aggregator: Aggregator = AveragingArguments.aggregator,
+        trim_fraction: float = AveragingArguments.trim_fraction,
+        server_step: ServerStep = AveragingArguments.server_step,
+        server_momentum: float = AveragingArguments.server_momentum,
     ) -> None:
         super().__init__()
-        check_aggregator(aggregator, trim_fraction)
-        check_server_step(server_step, server_momentum)
+        check_values(types_of(AveragingArguments), locals())
         self.prefixes = prefixes
         self.average_every = average_every
         self.average_until = average_until

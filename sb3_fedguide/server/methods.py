@@ -2,28 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 from sb3_fedguide.registry import ALGORITHMS, algorithm, registered_names
 from sb3_fedguide.seeding import Role, seed_sequence
-from sb3_fedguide.server.averaging import Averaging, averaged_prefixes, check_averaging
+from sb3_fedguide.server.averaging import Averaging, averaged_prefixes
 from sb3_fedguide.server.moments import ObservationMoments
 from sb3_fedguide.server.ot_moe import OTMoE
 from sb3_fedguide.server.payload import DDPG_ACTOR, DDPG_CRITIC, PPO_ACTOR, PPO_CRITIC
 from sb3_fedguide.server.strategy import Composite, Strategy
 from sb3_fedguide.server.svrpg import SVRPG
-from sb3_fedguide.server.validation import UPLOAD_BOUND
-from sb3_fedguide.settings.ranges import check_ranges
+from sb3_fedguide.settings.arguments import (
+    FedAvgArguments,
+    FederationArguments,
+    FedGuideAArguments,
+    FedGuideArguments,
+    FedGuideRArguments,
+    FedRLArguments,
+)
+from sb3_fedguide.settings.ranges import check_values
+from sb3_fedguide.settings.signatures import types_of
 
 Settings = Mapping[str, Any]
 #: Makes a strategy from complete settings, the number of clients and the federation's seed.
 Maker = Callable[[Settings, int, int], Strategy | None]
 
-#: What every server has to know; the defaults are those of the constructors of all federations.
-COMMON: dict[str, Any] = {"client_fraction": 1.0, "upload_bound": UPLOAD_BOUND, "normalize": False}
+#: What every server has to know.
+COMMON = ("client_fraction", "upload_bound", "normalize")
+#: What the server of an averaging method has to know. What clients do to their uploads is its business as far as all have to
+#: do the same.
+OF_AVERAGING = ("average_every", "average_until", "aggregator", "trim_fraction", "server_step", "server_momentum")
+AVERAGING = ("average", *OF_AVERAGING, "noise_multiplier", "clipping_norm")
+EXPERTISE = ("n_experts", "eta", "cost", "cost_scaling")
 
 
 @dataclass(frozen=True)
@@ -32,17 +45,23 @@ class Method:
 
     :param make: see :data:`Maker`
     :param defaults: its settings beside :data:`COMMON`, under the names that the model's constructor has for them
+    :param arguments: what the model's constructor takes, for the ranges of these settings
     """
 
     make: Maker
     defaults: Mapping[str, Any]
+    arguments: type = FederationArguments
+
+    @classmethod
+    def of(cls, make: Maker, arguments: type, names: Sequence[str]) -> Method:
+        """One whose settings are those ``names`` of ``arguments``, with the defaults that they have there."""
+        return cls(make, {name: getattr(arguments, name) for name in names}, arguments)
 
 
 def _averaging(kind: type[Averaging], actor: tuple[str, ...], critic: tuple[str, ...]) -> Maker:
     def make(settings: Settings, n_clients: int, seed: int) -> Strategy:
-        check_averaging(settings["average"], settings["average_every"])
         prefixes = averaged_prefixes(settings["average"], actor, critic)
-        return kind(prefixes, **{name: settings[name] for name in _OF_AVERAGING})
+        return kind(prefixes, **{name: settings[name] for name in OF_AVERAGING})
 
     return make
 
@@ -58,23 +77,14 @@ def _experts_and_parameters(settings: Settings, n_clients: int, seed: int) -> St
     return Composite([_experts(settings, n_clients, seed), averaging])
 
 
-_OF_AVERAGING = {
-    "average_every": 1, "average_until": None, "aggregator": "mean", "trim_fraction": 0.25, "server_step": 1.0,
-    "server_momentum": 0.0,
-}  # fmt: skip
-#: What clients do to their uploads is the server's business as far as all have to do the same.
-_OF_UPLOADS = {"noise_multiplier": 0.0, "clipping_norm": None}
-_AVERAGING = {"average": "all", **_OF_AVERAGING, **_OF_UPLOADS}
-_EXPERTS = {"n_experts": None, "eta": 0.05, "cost": "score", "cost_scaling": "max"}
-
 #: The methods' servers; :data:`sb3_fedguide.registry.ALGORITHMS` says whose is which.
 NOTHING = Method(lambda settings, n_clients, seed: None, {})
-PPO_AVERAGING = Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), _AVERAGING)
-PPO_AVERAGING_BEYOND = Method(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), {**_AVERAGING, "server_step": 2.0})
-SVRPG_AVERAGING = Method(_averaging(SVRPG, PPO_ACTOR, PPO_CRITIC), _AVERAGING)
-DDPG_AVERAGING = Method(_averaging(Averaging, DDPG_ACTOR, DDPG_CRITIC), _AVERAGING)
-EXPERTS = Method(_experts, _EXPERTS)
-EXPERTS_AND_PARAMETERS = Method(_experts_and_parameters, {**_EXPERTS, **_AVERAGING, "average": "actor", "average_every": 5})
+PPO_AVERAGING = Method.of(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), FedAvgArguments, AVERAGING)
+PPO_AVERAGING_BEYOND = Method.of(PPO_AVERAGING.make, FedGuideRArguments, AVERAGING)
+SVRPG_AVERAGING = Method.of(_averaging(SVRPG, PPO_ACTOR, PPO_CRITIC), FedAvgArguments, AVERAGING)
+DDPG_AVERAGING = Method.of(_averaging(Averaging, DDPG_ACTOR, DDPG_CRITIC), FedRLArguments, AVERAGING)
+EXPERTS = Method.of(_experts, FedGuideArguments, EXPERTISE)
+EXPERTS_AND_PARAMETERS = Method.of(_experts_and_parameters, FedGuideAArguments, (*EXPERTISE, *AVERAGING))
 
 
 def find_method(name: str) -> Method:
@@ -110,7 +120,7 @@ def complete_settings(algorithm: str | Method, given: Settings) -> dict[str, Any
     :raises ValueError: for a setting that the server does not have
     """
     method = find_method(algorithm) if isinstance(algorithm, str) else algorithm
-    settings = {**COMMON, **method.defaults}
+    settings = {**{name: getattr(FederationArguments, name) for name in COMMON}, **method.defaults}
     if unknown := sorted(given.keys() - settings.keys()):
         whose = f"of {algorithm} " if isinstance(algorithm, str) else ""
         raise ValueError(f"the server {whose}has no setting {unknown[0]!r}; it has {', '.join(sorted(settings))}")
@@ -129,11 +139,11 @@ def make_strategy(algorithm: str | Method, settings: Settings, n_clients: int, s
     :raises ValueError: for unknown settings, or values out of range
     """
     complete = complete_settings(algorithm, settings)
-    check_ranges(complete)
     method = find_method(algorithm) if isinstance(algorithm, str) else algorithm
+    check_values(types_of(method.arguments), complete)
     strategy = method.make(complete, n_clients, seed)
     if complete["normalize"] == "shared":
-        moments = ObservationMoments(complete.get("aggregator", "mean"), complete.get("trim_fraction", 0.25))
+        moments = ObservationMoments(**{name: complete[name] for name in ("aggregator", "trim_fraction") if name in complete})
         strategy = moments if strategy is None else Composite([strategy, moments])
     if strategy is not None:
         strategy.upload_bound = complete["upload_bound"]

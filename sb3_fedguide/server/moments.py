@@ -7,9 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_fedguide.server.averaging import Aggregator, check_aggregator, robust_mean
+from sb3_fedguide.server.averaging import robust_mean
 from sb3_fedguide.server.payload import OBSERVATION_COUNT, OBSERVATION_MEAN, OBSERVATION_VAR, Payload
 from sb3_fedguide.server.strategy import Strategy
+from sb3_fedguide.settings.arguments import Aggregator, AveragingArguments
+from sb3_fedguide.settings.ranges import check_values
+from sb3_fedguide.settings.signatures import types_of
 
 #: Weight of mean 0 and variance 1 before anything is known, as in SB3's ``RunningMeanStd``.
 START_COUNT = 1e-4
@@ -54,9 +57,11 @@ class ObservationMoments(Strategy):
     :param trim_fraction: see :func:`~sb3_fedguide.server.averaging.combine`
     """
 
-    def __init__(self, aggregator: Aggregator = "mean", trim_fraction: float = 0.25) -> None:
+    def __init__(
+        self, aggregator: Aggregator = AveragingArguments.aggregator, trim_fraction: float = AveragingArguments.trim_fraction
+    ) -> None:
         super().__init__()
-        check_aggregator(aggregator, trim_fraction)
+        check_values(types_of(AveragingArguments), locals())
         self.aggregator = aggregator
         self.trim_fraction = trim_fraction
         self.count = 0.0

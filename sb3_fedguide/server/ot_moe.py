@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from sb3_fedguide.server.strategy import Payload, Strategy
 from sb3_fedguide.server.validation import FEWEST_NORMS
+from sb3_fedguide.settings.arguments import CostScaling, FedGuideArguments, TransportCost
+from sb3_fedguide.settings.ranges import check_values
+from sb3_fedguide.settings.signatures import types_of
 
 HEAD = "prior.head"
 COST_ROW = "prior.cost_row"
@@ -169,7 +172,7 @@ def head_shares(plan: np.ndarray) -> np.ndarray:
     return (given.sum(axis=0) - np.diag(given)) / (len(plan) - 1)
 
 
-def scale_cost(cost: np.ndarray, scaling: Literal["max", "median"]) -> np.ndarray:
+def scale_cost(cost: np.ndarray, scaling: CostScaling) -> np.ndarray:
     """Costs over their maximum, or over the median of the positive ones; all-zero costs stay zero."""
     positive = cost[cost > 0]
     if not len(positive):
@@ -219,18 +222,13 @@ class OTMoE(Strategy):
     def __init__(
         self,
         n_experts: int,
-        eta: float = 0.05,
-        cost: Literal["score", "param"] = "score",
-        cost_scaling: Literal["max", "median"] = "max",
+        eta: float = FedGuideArguments.eta,
+        cost: TransportCost = FedGuideArguments.cost,
+        cost_scaling: CostScaling = FedGuideArguments.cost_scaling,
         seed: np.random.SeedSequence | int = 0,
     ) -> None:
         super().__init__()
-        if n_experts < 1:
-            raise ValueError(f"n_experts={n_experts} must be positive")
-        if eta <= 0:
-            raise ValueError(f"eta={eta} must be positive: it is the entropic regularisation of the transport plan")
-        if cost not in ("score", "param") or cost_scaling not in ("max", "median"):
-            raise ValueError(f"cost={cost!r} must be 'score' or 'param', and cost_scaling={cost_scaling!r} 'max' or 'median'")
+        check_values(types_of(FedGuideArguments), locals())
         self.n_experts, self.eta, self.cost, self.cost_scaling = n_experts, eta, cost, cost_scaling
         self.rng = np.random.default_rng(seed)
         self.experts: np.ndarray | None = None

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sb3_fedguide.server.payload import N_SAMPLES, OBSERVATION_COUNT, OBSERVATION_VAR, OBSERVATIONS, Payload
+from sb3_fedguide.settings.arguments import UPLOAD_BOUND as UPLOAD_BOUND
 
 #: An upload's arrays as names with shapes, in the order of names.
 Form = tuple[tuple[str, tuple[int, ...]], ...]
@@ -18,9 +19,6 @@ PARAMETERS = "parameters"
 
 #: Below so many uploads there is no majority that could tell an outlier.
 FEWEST_NORMS = 3
-
-#: Default bound on norms: at 10 an honest client of FedAvg on Bandit2D was rejected (six times the median of four).
-UPLOAD_BOUND = 30.0
 
 
 def check_uploads(

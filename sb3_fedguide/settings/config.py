@@ -8,13 +8,15 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
 
 from sb3_fedguide.registry import ALGORITHMS, algorithm, registered_names
-from sb3_fedguide.settings import schema
+from sb3_fedguide.settings import networks, schema
+from sb3_fedguide.settings.arguments import Rounds
 from sb3_fedguide.settings.names import check_names, nearest
+from sb3_fedguide.settings.networks import NetworkConfig
 from sb3_fedguide.settings.participants import n_participants
 
 if TYPE_CHECKING:
@@ -88,7 +90,7 @@ class Config:
         :raises ValueError: where the values do not fit together
         """
         values = {name: schema.schedule_or_value(value) for name, value in self.values.items() if name != "n_rounds"}
-        network = algorithm(self.algo).network_config.model_validate(values.pop("policy_kwargs"))
+        network = network_config(self.algo).model_validate(values.pop("policy_kwargs"))
         policy = values.pop("policy")
         with warnings.catch_warnings():
             # SB3 compares a client's batch_size with the steps of all clients; FederatedPPO has checked it against its own.
@@ -120,12 +122,8 @@ def resolve(
     :raises ValueError: for anything unknown, of the wrong type or out of range
     """
     check_names([algo], ALGORITHMS, "algorithm")
-    path = config_path(conf_file, algo)
     names = (entry or family.name, BACKBONE_FAMILIES.get(family.backbone, ""))
-    applied, merged = _entries(path, names, algo)
-    if conf_file in OVERLAYS:
-        merged = _merge(merged, _entries(_config_folder() / OVERLAYS[conf_file], names, algo)[1])
-    merged = _merge(merged, _nest(overrides or {}))
+    path, applied, merged = layers(algo, conf_file, names, overrides or {})
     try:
         values = complete(merged, algo)
     except ValueError as error:
@@ -137,14 +135,32 @@ def resolve(
     return Config(algo, applied, values)
 
 
-def _entries(path: Path, names: Sequence[str], algo: str) -> tuple[str, dict[str, Any]]:
+def layers(
+    algo: str, conf_file: str, names: Sequence[str], overrides: Mapping[str, Any], check: bool = True
+) -> tuple[Path, str, dict[str, Any]]:
+    """What a configuration, what goes over it, and ``overrides`` say together; values are not yet checked.
+
+    :param names: of entries, of which the first that the configuration has applies
+    :param overrides: nested ones by dotted keys
+    :param check: refuse unknown hyperparameters in files, and name the file
+    :return: the file, the entry that applied beyond ``default``, and the values
+    """
+    path = config_path(conf_file, algo)
+    applied, merged = _entries(path, names, algo, check)
+    if conf_file in OVERLAYS:
+        merged = _merge(merged, _entries(_config_folder() / OVERLAYS[conf_file], names, algo, check)[1])
+    return path, applied, _merge(merged, _nest(overrides))
+
+
+def _entries(path: Path, names: Sequence[str], algo: str, check: bool) -> tuple[str, dict[str, Any]]:
     """The first of the entries ``names`` that a file has, and what it says over the file's ``default``."""
     content = read_config(path)
     applied = next((name for name in names if name in content), DEFAULT)
     merged: dict[str, Any] = {}
     for name in dict.fromkeys((DEFAULT, applied)):
         if name in content:
-            _check_keys(content[name], algo, f"{path}, entry {name!r}")
+            if check:
+                _check_keys(content[name], algo, f"{path}, entry {name!r}")
             merged = _merge(merged, content[name])
     return applied, merged
 
@@ -161,18 +177,18 @@ def complete(given: Mapping[str, Any], algo: str) -> dict[str, Any]:
     """
     from sb3_fedguide.settings.pretraining import PretrainingConfig
 
-    parameters = schema.hyperparameters(algorithm(algo))
+    parameters = schema.hyperparameters_of(algo)
     _check_keys(given, algo, "the hyperparameters")
     if "n_rounds" not in given:
         raise ValueError("the number of rounds is missing; give n_rounds in the configuration, or --rounds")
     values: dict[str, Any] = {
         "policy": schema.check_value("policy", given.get("policy", "MlpPolicy"), _policy_type(algo)),
-        "n_rounds": schema.check_value("n_rounds", given["n_rounds"], int),
+        "n_rounds": schema.check_value("n_rounds", given["n_rounds"], Rounds),
     }
     for name, (hint, default) in parameters.items():
         if name not in NESTED:
             values[name] = schema.check_value(name, given[name], hint) if name in given else default
-    network = schema.check_model("policy_kwargs", algorithm(algo).network_config, given.get("policy_kwargs") or {}, {})
+    network = schema.check_model("policy_kwargs", network_config(algo), given.get("policy_kwargs") or {}, {})
     offline = schema.check_model("pretraining", PretrainingConfig, given.get("pretraining") or {}, _SET_ELSEWHERE)
     values["policy_kwargs"] = network.model_dump(mode="json")
     values["pretraining"] = offline.model_dump(mode="json", exclude=set(_SET_ELSEWHERE))
@@ -290,13 +306,16 @@ def parse_params(pairs: Sequence[str], flag: str = "-params") -> dict[str, Any]:
 
 
 def _policy_type(algo: str) -> Any:
-    from typing import Literal
+    return Literal[schema.policies(algo)]
 
-    return Literal[tuple(algorithm(algo).policy_aliases)]
+
+def network_config(algo: str) -> type[NetworkConfig]:
+    """What an algorithm's ``policy_kwargs`` are."""
+    return getattr(networks, schema.declared_arguments(algo).network_config)
 
 
 def _check_keys(values: Mapping[str, Any], algo: str, where: str) -> None:
-    known = {"policy", "n_rounds", *schema.hyperparameters(algorithm(algo))}
+    known = {"policy", "n_rounds", *schema.hyperparameters_of(algo)}
     for name in values:
         if not isinstance(name, str) or name not in known:
             raise ValueError(

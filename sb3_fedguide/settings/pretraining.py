@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["Count", "Piece", "PretrainingConfig", "prior_is_gaussian"]
+__all__ = ["DEFAULTS", "Count", "Piece", "PretrainingConfig", "prior_is_gaussian"]
 
 Count = Annotated[int, Field(ge=1, lt=2**31)]
 Size = Annotated[int, Field(ge=1, le=10_000_000)]  # far above what is useful, and below what no memory holds
@@ -81,3 +81,7 @@ class PretrainingConfig(BaseModel):
             for name, value in self.model_dump(mode="json").items()
             if name.split("_")[0] in pieces and not name.endswith(("_updates", "_epochs"))
         }
+
+
+#: As it is by default: the functions of the offline stage take their defaults from it.
+DEFAULTS = PretrainingConfig()

@@ -1,117 +1,123 @@
-"""The ranges of all hyperparameters, for constructors and the command line alike."""
+"""What numbers and choices a parameter takes: read off its type, wherever that stands, and checked in one way."""
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Mapping
+import operator
+import types
+import typing
+from collections.abc import Callable, Mapping
 from numbers import Integral, Real
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-_OPEN = 1e-12  # smallest value of what must be positive
-
+#: Smallest value of what must be positive.
+OPEN = 1e-12
 #: Any integer stays below this.
 MAX_INTEGER = 2**31
 
 
 class Range(NamedTuple):
-    """A closed range of numbers.
+    """A range of numbers, in the type of what it bounds: ``mu: Annotated[float, Range(0)]``.
 
-    :param whole: integers only
-    :param words: values that are no numbers, such as ``None``
+    :param why: what the message about another number adds to the bounds
+    :param without_high: ``high`` itself is not in it
+    :param start: what a schedule may begin with, where that is more than ``high``
     """
 
     low: float
     high: float = math.inf
-    whole: bool = False
-    words: tuple[Any, ...] = ()
+    why: str = ""
+    without_high: bool = False
+    start: float = 0.0
+
+    def __str__(self) -> str:
+        """As an interval."""
+        high = "∞)" if self.high == math.inf else f"{self.high:g}{')' if self.without_high else ']'}"
+        return f"{'(0' if self.low == OPEN else f'[{self.low:g}'}, {high}"
+
+    def expected(self, number: float) -> str:
+        """What a number that is not in it must be."""
+        if self.high <= 1:
+            within = self.low == OPEN or self.without_high
+            return f"in {self}" if within else f"between {self.low:g} and {self.high:g}"
+        if number < self.low:
+            return "positive" if self.low == OPEN else f"at least {self.low:g}"
+        return f"at most {self.high:.0f}"
 
 
-_COUNT = Range(1, whole=True)
-_POSITIVE = Range(_OPEN)
-_NOT_NEGATIVE = Range(0)
-_SHARE = Range(0, 1)
-
-#: Sizes end far above what is useful and below what no memory holds.
-RANGES: dict[str, Range] = {
-    "n_rounds": Range(1, 1e7, whole=True),
-    "learning_rate": _POSITIVE,
-    "n_epochs": _COUNT,
-    "batch_size": Range(1, 1e7, whole=True),
-    "gamma": _SHARE,
-    "gae_lambda": _SHARE,
-    "clip_range": _POSITIVE,
-    "clip_range_vf": Range(_OPEN, words=(None,)),
-    "ent_coef": _NOT_NEGATIVE,
-    "vf_coef": _NOT_NEGATIVE,
-    "max_grad_norm": _POSITIVE,
-    "n_envs_per_client": Range(1, 1000, whole=True),
-    "num_threads": Range(1, 1000, whole=True),
-    "rollout_size": Range(2, 1e7, whole=True),
-    "stats_window_size": _COUNT,
-    "bc_weight": _SHARE,
-    "client_fraction": Range(_OPEN, 1),
-    "upload_bound": Range(_OPEN, words=(None,)),
-    "trim_fraction": Range(0, 0.5),
-    "lambda_trust": _NOT_NEGATIVE,
-    "lambda_prior": _NOT_NEGATIVE,
-    "prior_horizon": _COUNT,
-    "beta": Range(0, 1, words=("auto",)),
-    "n_experts": Range(1, 1e4, whole=True, words=(None,)),
-    "eta": _POSITIVE,
-    "prior_states": Range(1, 1e7, whole=True, words=(None,)),
-    "density_steps": _COUNT,
-    "sampling_steps": _COUNT,
-    "adapt_temperature": _POSITIVE,
-    "adapt_weight": _SHARE,
-    "average_every": _COUNT,
-    "average_until": Range(1, whole=True, words=(None,)),
-    "server_step": Range(_OPEN, words=("exp",)),
-    "server_momentum": Range(0, 1),
-    "mix": Range(0, 100),
-    "screening": Range(0, 0.5),
-    "noise_multiplier": Range(0, 1e6),
-    "clipping_norm": Range(_OPEN, words=(None,)),
-    "delta": Range(_OPEN, 0.1),
-    "buffer_size": Range(1, 1e8, whole=True),
-    "learning_starts": Range(0, whole=True),
-    "tau": Range(_OPEN, 1),
-    "train_freq": _COUNT,
-    "noise_theta": _NOT_NEGATIVE,
-    "noise_sigma": _NOT_NEGATIVE,
-    "noise_dt": _POSITIVE,
-    "mu": _NOT_NEGATIVE,
-    "lambda_global": _NOT_NEGATIVE,
-    "lambda_local": _NOT_NEGATIVE,
-    "reference_every": _COUNT,
-}
+def options(hint: Any) -> list[Any]:
+    """The types of which a value may have any, without ranges."""
+    if typing.get_origin(hint) is typing.Annotated:
+        return options(typing.get_args(hint)[0])
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return [option for part in typing.get_args(hint) for option in options(part)]
+    return [hint]
 
 
-def check_ranges(values: Mapping[str, Any]) -> None:
-    """Check those of ``values`` that have a range; of a schedule of the remaining progress, what it begins with.
+def plain(hint: Any) -> Any:
+    """A type without ranges."""
+    return hint if isinstance(hint, str) else functools.reduce(operator.or_, options(hint))
 
-    :raises ValueError: for the first that is no number or out of its range
+
+def is_schedule(option: Any) -> bool:
+    return typing.get_origin(option) is Callable or option is Callable
+
+
+def range_of(hint: Any) -> Range | None:
+    """The range in a type; of several, the first."""
+    if typing.get_origin(hint) is typing.Annotated:
+        found = [part for part in hint.__metadata__ if isinstance(part, Range)]
+        return found[0] if found else range_of(typing.get_args(hint)[0])
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return next((limits for part in typing.get_args(hint) if (limits := range_of(part)) is not None), None)
+    return None
+
+
+def choices(hint: Any) -> list[Any]:
+    """The words among the values of a type; ``None`` is one."""
+    found = [typing.get_args(option) if typing.get_origin(option) is Literal else () for option in options(hint)]
+    return [word for words in found for word in words] + [None] * (type(None) in options(hint))
+
+
+def check_values(hints: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    """Check those of ``values`` that have a range or choices; of a schedule of the remaining progress, what it begins with.
+
+    :param hints: types by name
+    :raises ValueError: for the first that is none of its choices, no number or out of its range
     """
-    for name, limits in RANGES.items():
-        if name not in values or any(values[name] is word or values[name] == word for word in limits.words):
-            continue
-        value = values[name](1.0) if callable(values[name]) else values[name]
-        if not isinstance(value, Real) or isinstance(value, bool) or (limits.whole and not isinstance(value, Integral)):
-            raise ValueError(f"{name} must be {'an integer' if limits.whole else 'a number'}, but it is {value!r}")
-        check_range(name, value)
+    for name, hint in hints.items():
+        if name in values:
+            _check(name, values[name], hint)
 
 
-def check_range(name: str, number: Real | float) -> None:
-    """:raises ValueError: for a number that is out of the range of the hyperparameter ``name``, or that is not finite"""
+def _check(name: str, value: Any, hint: Any) -> None:
+    kinds, words, limits = options(hint), choices(hint), range_of(hint)
+    if any(value is word or (isinstance(word, str) and value == word) for word in words):
+        return
+    named = [word for word in words if word is not None]
+    if limits is None:
+        if named and all(typing.get_origin(kind) is Literal or kind is type(None) for kind in kinds):
+            raise ValueError(f"{name}={value!r} must be one of {', '.join(named)}")
+        return
+    scheduled = callable(value)
+    value = value(1.0) if scheduled else value
+    whole = float not in kinds
+    if not isinstance(value, Real) or isinstance(value, bool) or (whole and not isinstance(value, Integral)):
+        expected = " or ".join(["an integer" if whole else "a number", *map(repr, named)])
+        raise ValueError(f"{name} must be {expected}, but it is {value!r}")
+    check_number(name, value, limits, scheduled)
+
+
+def check_number(name: str, number: Real | float, limits: Range | None = None, scheduled: bool = False) -> None:
+    """:raises ValueError: for a number that is not finite or not in its range"""
     if isinstance(number, Integral) and abs(int(number)) >= MAX_INTEGER:
         raise ValueError(f"{name} must be below 2^31, but it has {len(str(abs(int(number))))} digits")
-    number = float(number)
-    if not math.isfinite(number):
-        raise ValueError(f"{name}={number} must be finite")
-    limits = RANGES.get(name, Range(-math.inf))
-    if not limits.low <= number <= limits.high:
-        lower = "positive" if limits.low == _OPEN else f"at least {limits.low:g}"
-        if limits.high <= 1:
-            expected = f"in (0, {limits.high:g}]" if limits.low == _OPEN else f"between {limits.low:g} and {limits.high:g}"
-        else:
-            expected = lower if number < limits.low else f"at most {limits.high:.0f}"
-        raise ValueError(f"{name}={number:g} must be {expected}")
+    value = float(number)
+    if not math.isfinite(value):
+        raise ValueError(f"{name}={value} must be finite")
+    if limits is None:
+        return
+    high = max(limits.high, limits.start) if scheduled else limits.high
+    if not limits.low <= value <= high or (limits.without_high and value == high):
+        raise ValueError(f"{name}={value:g} must be {limits.expected(value)}{limits.why and ': ' + limits.why}")

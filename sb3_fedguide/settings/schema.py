@@ -5,18 +5,19 @@ from __future__ import annotations
 import functools
 import operator
 import re
-import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Literal
 
 import pydantic
 
 from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.settings.arguments import FederationArguments
 from sb3_fedguide.settings.names import check_names
-from sb3_fedguide.settings.ranges import check_range
-from sb3_fedguide.settings.signatures import parameters
+from sb3_fedguide.settings.ranges import check_number, is_schedule, options, range_of
+from sb3_fedguide.settings.signatures import declared
 
 #: Constructor parameters that have a flag of their own or no meaning on the command line.
 NOT_HYPERPARAMETERS = {
@@ -29,19 +30,39 @@ NOT_HYPERPARAMETERS = {
 SCHEDULE = re.compile(r"^(?P<kind>lin|until)_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)?)$")
 
 
-@functools.cache
+def declared_arguments(algo: str) -> type[FederationArguments]:
+    """The dataclass that an algorithm's constructor takes; of an algorithm of the user's own, that of its nearest base."""
+    known = ALGORITHMS[algo].arguments
+    if known is None:
+        taken: list[Any] = [getattr(vars(base).get("__init__"), "arguments", object) for base in algorithm(algo).__mro__]
+        return next(kind for kind in taken if issubclass(kind, FederationArguments))
+    module, _, name = known.partition(":")
+    return getattr(import_module(module), name)
+
+
+def policies(algo: str) -> tuple[str, ...]:
+    """Names of the policies that an algorithm has."""
+    own = ALGORITHMS[algo].arguments is None
+    return tuple(algorithm(algo).policy_aliases) if own else declared_arguments(algo).policies
+
+
 def hyperparameters(algorithm: type) -> Mapping[str, tuple[Any, Any]]:
-    """Name to (type, default) of every hyperparameter of an algorithm, its own first, then those of its bases."""
-    return {
-        name: (parameter.annotation, parameter.default)
-        for name, parameter in parameters(algorithm).items()
-        if name not in NOT_HYPERPARAMETERS
-    }
+    """Name to (type, default) of every hyperparameter of an algorithm, its own first, then those of its bases.
+
+    :param algorithm: its class, or the dataclass that its constructor takes
+    """
+    return {name: known for name, known in declared(algorithm).items() if name not in NOT_HYPERPARAMETERS}
+
+
+def hyperparameters_of(algo: str) -> Mapping[str, tuple[Any, Any]]:
+    """:func:`hyperparameters` by command-line name. Of the algorithms that are here this does without PyTorch."""
+    entry = ALGORITHMS[algo]
+    return hyperparameters(algorithm(algo) if entry.arguments is None else declared_arguments(algo))
 
 
 def all_names() -> list[str]:
     """Hyperparameters of all algorithms together, each once."""
-    return list(dict.fromkeys(name for known in ALGORITHMS for name in hyperparameters(algorithm(known))))
+    return list(dict.fromkeys(name for known in ALGORITHMS for name in hyperparameters_of(known)))
 
 
 def check_value(name: str, value: Any, hint: Any) -> Any:
@@ -49,25 +70,25 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
 
     :raises ValueError: for a value of another type or out of range
     """
-    options = _options(hint)
-    schedule = _takes_schedule(options)
-    options = [option for option in options if not _is_callable_type(option)]
+    every = options(hint)
+    kinds = [kind for kind in every if not is_schedule(kind)]
+    schedule, scheduled = len(kinds) < len(every), False
     number = value
     if schedule and isinstance(value, str) and (match := SCHEDULE.match(value)):
-        number = float(match["value"])
+        number, scheduled = float(match["value"]), True
         if match["kind"] == "until":
             if name != "mix":
                 raise ValueError(f"{name}={value!r} is a schedule of mix alone; other values take one such as lin_3e-4")
             Until(number)
     else:
         try:
-            union: Any = functools.reduce(operator.or_, options)
+            union: Any = functools.reduce(operator.or_, kinds)
             value = number = pydantic.TypeAdapter(union).validate_python(value, strict=True)
         except pydantic.ValidationError:
-            expected = " or ".join([_describe(option) for option in options] + ["a schedule such as lin_3e-4"] * schedule)
+            expected = " or ".join([_describe(kind) for kind in kinds] + ["a schedule such as lin_3e-4"] * schedule)
             raise ValueError(f"{name} must be {expected}, but it is {_show(value)}") from None
     if isinstance(number, float | int) and not isinstance(number, bool):
-        check_range(name, number)
+        check_number(name, number, range_of(hint), scheduled)
     return value
 
 
@@ -123,20 +144,6 @@ class Until:
 def _reason(problem: Any) -> str:
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input ")
     return message[0].lower() + message[1:]
-
-
-def _options(hint: Any) -> list[Any]:
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return [option for part in typing.get_args(hint) for option in _options(part)]
-    return [hint]
-
-
-def _is_callable_type(hint: Any) -> bool:
-    return typing.get_origin(hint) is Callable or hint is Callable
-
-
-def _takes_schedule(options: list[Any]) -> bool:
-    return any(_is_callable_type(option) for option in options)
 
 
 def _describe(hint: Any) -> str:

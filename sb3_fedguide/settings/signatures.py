@@ -2,10 +2,76 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import inspect
 import typing
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from sb3_fedguide.settings.ranges import plain
+
+P = ParamSpec("P")
+A = TypeVar("A")
+#: Arguments that may stand without their names.
+FIRST = ("policy", "env")
+
+
+def takes(arguments: Callable[P, A]) -> Callable[[Callable[[Any, A], None]], Callable[Concatenate[Any, P], None]]:
+    """Of a constructor: it is called with the fields of a dataclass and gets them as one object, completed by defaults.
+
+    :param arguments: the dataclass, such as :class:`~sb3_fedguide.settings.arguments.FedAvgArguments`
+    """
+
+    def decorate(constructor: Callable[[Any, A], None]) -> Callable[Concatenate[Any, P], None]:
+        @functools.wraps(constructor)
+        def __init__(self: Any, *args: P.args, **kwargs: P.kwargs) -> None:
+            constructor(self, arguments(*args, **kwargs))
+
+        __init__.arguments, __init__.hands_on = arguments, False  # type: ignore[attr-defined]
+        own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        __init__.__signature__ = _shown([own, *_stated(__init__)])  # type: ignore[attr-defined]
+        return typing.cast(Callable[Concatenate[Any, P], None], __init__)
+
+    return decorate
+
+
+def adds(arguments: Callable[..., A]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Of a mixin's constructor: as :func:`takes`, and what the dataclass does not know comes after it, to be handed on."""
+    names = [field.name for field in dataclasses.fields(arguments)]  # type: ignore[arg-type]
+
+    def decorate(constructor: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(constructor)
+        def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
+            given = arguments(**{name: kwargs.pop(name) for name in names if name in kwargs})
+            constructor(self, given, *args, **kwargs)
+
+        __init__.arguments, __init__.hands_on = arguments, True  # type: ignore[attr-defined]
+        return __init__
+
+    return decorate
+
+
+@functools.cache
+def declared(kind: Any) -> Mapping[str, tuple[Any, Any]]:
+    """Name to (type, default) of what a class or a dataclass of arguments takes: policy and environments, its own, then those
+    of its bases."""
+    if not dataclasses.is_dataclass(kind):
+        return {name: (parameter.annotation, parameter.default) for name, parameter in parameters(kind).items()}
+    known = {field.name: field for field in dataclasses.fields(kind)}
+    bases: tuple[type, ...] = kind.__mro__  # type: ignore[union-attr]
+    own = [name for cls in bases for name in vars(cls).get("__annotations__", ()) if name in known]
+    missing, empty = dataclasses.MISSING, inspect.Parameter.empty
+    return {
+        name: (known[name].type, empty if known[name].default is missing else known[name].default)
+        for name in dict.fromkeys([name for name in FIRST if name in known] + own)
+    }
+
+
+@functools.cache
+def types_of(kind: Any) -> Mapping[str, Any]:
+    """Name to type, with its range, of what a class or a dataclass of arguments takes."""
+    return {name: hint for name, (hint, _) in declared(kind).items()}
 
 
 def constructors(cls: type) -> Iterator[Any]:
@@ -16,7 +82,7 @@ def constructors(cls: type) -> Iterator[Any]:
             continue
         yield constructor
         kinds = [parameter.kind for parameter in inspect.signature(constructor).parameters.values()]
-        if inspect.Parameter.VAR_KEYWORD not in kinds:
+        if not getattr(constructor, "hands_on", inspect.Parameter.VAR_KEYWORD in kinds):
             return
 
 
@@ -24,16 +90,35 @@ def parameters(cls: type) -> dict[str, inspect.Parameter]:
     """Every parameter of these constructors by name, with its type resolved; what comes from a base takes a keyword only."""
     found: dict[str, inspect.Parameter] = {}
     for number, constructor in enumerate(constructors(cls)):
-        hints = typing.get_type_hints(constructor)
-        for name, parameter in inspect.signature(constructor).parameters.items():
-            if name != "self" and parameter.kind is not parameter.VAR_KEYWORD and name not in found:
-                kind = parameter.kind if number == 0 else parameter.KEYWORD_ONLY
-                found[name] = parameter.replace(annotation=hints.get(name, Any), kind=kind)
-    return found
+        for parameter in _stated(constructor):
+            if parameter.name not in found:
+                found[parameter.name] = parameter if number == 0 else parameter.replace(kind=parameter.KEYWORD_ONLY)
+    return dict(sorted(found.items(), key=lambda item: item[1].kind))
+
+
+def _stated(constructor: Any) -> list[inspect.Parameter]:
+    """The parameters of one constructor, without those that it hands on."""
+    positional, keyword = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
+    if hasattr(constructor, "arguments"):
+        return [
+            inspect.Parameter(name, positional if name in FIRST else keyword, default=default, annotation=hint)
+            for name, (hint, default) in declared(constructor.arguments).items()
+        ]
+    hints = typing.get_type_hints(constructor, include_extras=True)
+    return [
+        parameter.replace(annotation=hints.get(name, Any))
+        for name, parameter in inspect.signature(constructor).parameters.items()
+        if name != "self" and parameter.kind in (positional, keyword)
+    ]
 
 
 class CompleteSignature:
-    """As ``__signature__`` of a class, it shows :func:`parameters` to ``help()``, ``inspect.signature()`` and IDEs."""
+    """As ``__signature__`` of a class, it shows :func:`parameters` to ``help()``, ``inspect.signature()`` and IDEs, without
+    their ranges."""
 
     def __get__(self, instance: Any, owner: type) -> inspect.Signature:
-        return inspect.Signature(list(parameters(owner).values()))
+        return _shown(parameters(owner).values())
+
+
+def _shown(known: Iterable[inspect.Parameter]) -> inspect.Signature:
+    return inspect.Signature([parameter.replace(annotation=plain(parameter.annotation)) for parameter in known])
