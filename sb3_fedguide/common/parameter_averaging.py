@@ -22,6 +22,7 @@ from sb3_fedguide.server.averaging import (
     policy_is_due,
 )
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload
+from sb3_fedguide.state.held import Held
 
 
 class ParameterAveraging(Federation):
@@ -51,7 +52,7 @@ class ParameterAveraging(Federation):
     All other parameters are those of the learner, :class:`FederatedPPO` or :class:`FederatedDDPG`.
     """
 
-    state_attributes: ClassVar[tuple[str, ...]] = ("screening_state", "privacy_state", "known_parameters")
+    state_attributes: ClassVar[tuple[str | Held, ...]] = ("screening_state", "privacy_state", "known_parameters")
 
     def __init__(
         self,
@@ -85,7 +86,7 @@ class ParameterAveraging(Federation):
         self.server_momentum = server_momentum
         self.mix = mix
         self.screening = screening
-        #: see :attr:`Screening.state`; empty until the first test or without tests
+        #: see :meth:`Screening.begin`; empty without tests
         self.screening_state: dict[str, np.ndarray] = {}
         self._tests = Screening(self)
         self.noise_multiplier = noise_multiplier
@@ -99,8 +100,9 @@ class ParameterAveraging(Federation):
         self._shares: dict[int, float] = {}
         super().__init__(policy, env, **learner)  # type: ignore[arg-type, misc]
 
-    def _setup_model(self) -> None:
-        super()._setup_model()  # type: ignore[safe-super]  # the learner's
+    def _setup_state(self) -> None:
+        super()._setup_state()
+        self._tests.begin()
         self._privacy.begin()
 
     def _identity(self) -> dict[str, Any]:
@@ -169,15 +171,10 @@ class ParameterAveraging(Federation):
         """The share that clients take now, in [0, 1]."""
         return min(1.0, max(0.0, self.mix(self._current_progress_remaining))) if callable(self.mix) else self.mix
 
-    def complete_state(self) -> None:
-        super().complete_state()
-        if self.screening:
-            self._tests.begin()
-
     def test_work(self) -> np.ndarray | None:
         if not self.screening:
             return None
-        untimed = self._tests.begin()["untimed"]
+        untimed = self.screening_state["untimed"]
         work = untimed / self.rollout_size
         untimed[:] = 0
         return work
