@@ -83,7 +83,7 @@ class Resumable(BaseAlgorithm):
         """
         state: State = {
             "identity": self._identity(),
-            "attributes": save_held(self, shared=False),
+            "attributes": save_held(self),
             "shared": save_held(self, shared=True),
             "policy": to_arrays(self.policy.state_dict()),
             "optimizers": [optimizer_state(optimizer) for optimizer in self._optimizers()],

@@ -40,7 +40,7 @@ def held_by(owner: Any) -> dict[str, Held]:
     return {held.name: held for held in (entry if isinstance(entry, Held) else Held(entry) for entry in entries)}
 
 
-def save_held(owner: Any, shared: bool) -> State:
+def save_held(owner: Any, shared: bool = False) -> State:
     """What ``owner`` holds for its clients each, or for all together, as plain data by attribute.
 
     :raises ValueError: for an attribute that is no plain data
