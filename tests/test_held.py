@@ -98,13 +98,13 @@ def test_what_only_rounds_give_is_left_out_of_files_until_it_is_there(tmp_path):
 
 def test_fedguide_takes_a_file_from_before_the_first_round_as_new(tmp_path):
     offline = {"dataset_size": 60, "dice_updates": 2, "prior_updates": 2, "dice_width": 4}
-    settings = {**SMALL, "pretraining": offline, "calibrate": True}
+    settings = {**SMALL, "pretraining": offline, "calibrate": True, "adapt": "advantage"}
     model, trained = (FedGuide("MlpPolicy", "Bandit2D", **{**settings, "seed": seed}) for seed in (0, 7))
     assert isinstance(model.prior, GaussianPrior) and np.isnan(model.experts).all()
     model.pretrain()
     model.export_parameters(tmp_path / "parameters.npz")
     trained.learn(16 * 4)
-    assert trained.calibrated.all() and np.isfinite(trained.experts).all()
+    assert trained.calibrated.all() and np.isfinite(trained.experts).all() and trained.recent_statistics["weight"].all()
     trained.import_parameters(tmp_path / "parameters.npz")
-    assert not trained.calibrated.any() and np.isnan(trained.experts).all()
+    assert not trained.calibrated.any() and np.isnan(trained.experts).all() and not trained.recent_statistics["weight"].any()
     np.testing.assert_array_equal(trained.heads, model.heads)

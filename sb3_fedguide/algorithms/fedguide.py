@@ -72,7 +72,7 @@ class FedGuide(FederatedPPO):
         Held("heads", part="prior", file="prior/heads"),
         Held("score_moments", part="prior", file="prior/moments"),
         Held("offline_statistics", part="adaptation", file="prior/"),
-        "recent_statistics",
+        Held("recent_statistics", part="adaptation"),
         Held("dice", part="dice", file="dice/"),
         Held("experts", part="experts", file="prior/experts", later=True),
         Held("mixture_rows", part="experts", file="prior/mixture_rows", later=True),
@@ -339,8 +339,9 @@ class FedGuide(FederatedPPO):
         for i, rng in self.present_streams(Role.HEAD):
             offline = HeadStatistics(**{name: array[i] for name, array in self.offline_statistics.items()}, weight=1.0)
             recent = HeadStatistics(**{name: array[i] for name, array in self.recent_statistics.items()})
-            how = self.adapt_weight, self.adapt_temperature
-            head, recent = refit_head(self.prior, offline, recent, *how, raw[i], executed[i], advantages[i], rng)
+            head, recent = refit_head(
+                self.prior, offline, recent, self.adapt_weight, self.adapt_temperature, raw[i], executed[i], advantages[i], rng
+            )
             for name, array in self.recent_statistics.items():
                 array[i] = getattr(recent, name)
             moved[i] = np.linalg.norm(head - self.heads[i]) / np.linalg.norm(self.heads[i])

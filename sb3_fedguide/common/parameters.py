@@ -90,7 +90,7 @@ class ParameterFiles(ClientPolicies, Resumable):
 
 def _exported(model: ParameterFiles) -> list[Held]:
     """What this model's files hold beside policies and normalisation, once it has been through the offline stage."""
-    return [held for held in held_by(model).values() if held.part and getattr(model, held.name) is not None]
+    return [held for held in held_by(model).values() if held.part and getattr(model, held.name, None) is not None]
 
 
 def _complete_parts(model: ParameterFiles) -> list[str]:

@@ -23,7 +23,8 @@ class Held:
     :param name: of the attribute, with dots for an attribute's own (``"noise.state"``)
     :param shared: all clients have the same; it has no client axis
     :param part: what parameter files call it together with what comes with it; they leave it out by default
-    :param file: in parameter files, the name of its array, or what the names of its arrays begin with
+    :param file: in parameter files, the name of its array, or what the names of its arrays begin with; without a name they do
+        not hold it, and it begins anew where its part comes from a file
     :param later: rounds give it, and not the offline stage; files leave it out as long as it is NaN
     """
 
@@ -67,6 +68,8 @@ def load_held(owner: Any, state: State) -> None:
 
 def file_arrays(owner: Any, held: Held) -> dict[str, np.ndarray]:
     """The arrays of an attribute themselves, no copies, by their names in parameter files."""
+    if not held.file:
+        return {}
     value = recursive_getattr(owner, held.name)
     if isinstance(value, np.ndarray):
         return {held.file: value}
