@@ -101,18 +101,3 @@ def generator(state: State) -> np.random.Generator:
     except (KeyError, TypeError) as error:
         raise ValueError(f"the state of a random generator is damaged: {error!r}") from None
     return np.random.Generator(bits)
-
-
-def declared_state(owner: Any) -> State:
-    """The attributes that the classes of ``owner`` name in ``state_attributes``, as plain data.
-
-    :raises ValueError: for an attribute that is no plain data
-    """
-    declared = [name for kind in type(owner).__mro__ for name in vars(kind).get("state_attributes", ())]
-    return freeze({name: getattr(owner, name) for name in dict.fromkeys(declared) if hasattr(owner, name)})
-
-
-def load_declared(owner: Any, state: State) -> None:
-    """Put back what :func:`declared_state` returned."""
-    for name, value in thaw(state).items():
-        setattr(owner, name, value)

@@ -11,11 +11,10 @@ from typing import Any
 import gymnasium
 from gymnasium.spaces import Space
 
-from fed_envs.plain_data import State, declared_state, freeze, generator, load_declared, thaw
+from fed_envs.plain_data import State, freeze, generator, thaw
 
 __all__ = [
-    "State", "attributes", "declared_state", "freeze", "generator", "gives_state", "load_declared", "load_state", "save_state",
-    "set_attributes", "thaw",
+    "State", "attributes", "freeze", "generator", "gives_state", "load_state", "save_state", "set_attributes", "thaw",
 ]  # fmt: skip
 
 #: Attributes of Gymnasium's classes (and the file of SB3's Monitor) that say what an environment is, not where it stands.

@@ -141,9 +141,9 @@ def test_a_crafted_file_executes_nothing(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"format": 3, "state": {}}', "format 3 and this version reads 2"),
+        ('{"format": 2, "state": {}}', "format 2 and this version reads 3: go on with the version of the package"),
         ('{"state": {}}', "no checkpoint"),
-        ('{"format": 2, "state": {"x": {"__type__": "array", "name": "gone"}}}', "no checkpoint"),
+        ('{"format": 3, "state": {"x": {"__type__": "array", "name": "gone"}}}', "no checkpoint"),
         ("[1", "no checkpoint"),
         ("[]", "no checkpoint"),
         (None, "no checkpoint"),

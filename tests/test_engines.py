@@ -84,7 +84,7 @@ def test_parts_of_a_state_and_back():
 
 
 def test_a_state_without_a_client_axis_is_refused():
-    with pytest.raises(ValueError, match=r"table in the state has 3 entries for 2 clients.*shared_state"):
+    with pytest.raises(ValueError, match=r"table in the state has 3 entries for 2 clients.*shared=True"):
         take_clients({"table": np.zeros((3, 2))}, [0], 2, set())
 
 

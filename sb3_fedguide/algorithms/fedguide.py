@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 import torch as th
 
-from fed_envs.state import State
-from sb3_fedguide.algorithms.fedguide_parts import begin_parts, offline_parts, part_arrays, set_part_arrays
+from sb3_fedguide.common.anchors import Parameters
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.parameter_averaging import ParameterAveraging
 from sb3_fedguide.common.rollout_buffer import FederatedSamples, generalized_advantage
 from sb3_fedguide.common.value_blend import baseline_metrics, optimal_blend
 from sb3_fedguide.offline.dice import DiceValue, calibrate
-from sb3_fedguide.offline.pretraining import Pretraining
-from sb3_fedguide.priors.adaptation import HeadAdaptation
-from sb3_fedguide.priors.base import Prior, score_cost
+from sb3_fedguide.offline.pretraining import Pretraining, untrained_prior
+from sb3_fedguide.priors.base import HeadStatistics, Prior, score_cost
 from sb3_fedguide.priors.importance import importance_weights
 from sb3_fedguide.priors.mixture import mixture_log_prob, mixture_sample
+from sb3_fedguide.priors.refit import refit_head
 from sb3_fedguide.seeding import Role
 from sb3_fedguide.server.ot_moe import COST_ROW, EXPERTS, HEAD, MIXTURE_ROW
 from sb3_fedguide.server.strategy import Payload
 from sb3_fedguide.settings.arguments import FederatedPPOArguments, FedGuideAArguments, FedGuideArguments
 from sb3_fedguide.settings.signatures import takes
-from sb3_fedguide.state.stacked import to_arrays, to_tensors
+from sb3_fedguide.state.held import Held
 
 #: Raw actions further outside the action box than this get no importance weight: no behaviour data can lie there.
 ACTION_MARGIN = 0.1
@@ -68,10 +66,28 @@ class FedGuide(FederatedPPO):
 
     uses_prior = True
     uses_dice: ClassVar[bool] = True
-    state_attributes: ClassVar[tuple[str, ...]] = (
-        "heads", "score_moments", "experts", "mixture_rows", "dice_scale", "calibrated",
-    )  # fmt: skip
-    shared_state = ("parts", "modules.prior")
+    state_attributes: ClassVar[tuple[str | Held, ...]] = (
+        Held("prior", shared=True, part="prior", file="prior/trunk/"),
+        Held("heads", part="prior", file="prior/heads"),
+        Held("score_moments", part="prior", file="prior/moments"),
+        Held("offline_statistics", part="adaptation", file="prior/"),
+        Held("recent_statistics", part="adaptation"),
+        Held("dice", part="dice", file="dice/"),
+        Held("experts", part="experts", file="prior/experts", later=True),
+        Held("mixture_rows", part="experts", file="prior/mixture_rows", later=True),
+        Held("dice_scale", part="calibration", file="dice_scale", later=True),
+        Held("calibrated", part="calibration", file="dice_calibrated", later=True),
+    )
+    prior: Prior
+    heads: np.ndarray  # psi_i, (n_clients, action_dim, p + 1)
+    score_moments: np.ndarray  # S_i of the score cost, (n_clients, p + 1, p + 1); stay with their client
+    experts: np.ndarray  # what each client last received, (n_clients, n_experts, action_dim, p + 1); NaN before
+    mixture_rows: np.ndarray  # R_i, (n_clients, n_experts); NaN before the first plan
+    dice: DiceValue | None = None
+    dice_scale: np.ndarray | None = None  # (n_clients, 2): a and b of the calibration
+    calibrated: np.ndarray | None = None  # (n_clients,) bool
+    offline_statistics: Parameters | None = None  # of each client's head, by the fields of HeadStatistics
+    recent_statistics: Parameters | None = None
 
     @takes(FedGuideArguments)
     def __init__(self, given: FedGuideArguments) -> None:
@@ -92,24 +108,40 @@ class FedGuide(FederatedPPO):
         self.adapt = given.adapt
         self.adapt_temperature = given.adapt_temperature
         self.adapt_weight = given.adapt_weight
-        self.prior: Prior | None = None
-        self.dice: DiceValue | None = None
-        self.dice_scale: np.ndarray | None = None  # (n_clients, 2): a and b of the calibration
-        self.adaptation: HeadAdaptation | None = None
-        self.experts: np.ndarray | None = None  # what each client last received, (n_clients, n_experts, ...)
         super().__init__(**given.of(FederatedPPOArguments))
+
+    def _setup_state(self) -> None:
+        super()._setup_state()
+        assert self.seed is not None
+        n, (obs_dim,), (action_dim,) = self.n_clients, self.observation_space.shape, self.action_space.shape  # type: ignore[misc]
+        self.hold(prior=untrained_prior(self.family, self.pretraining_config, obs_dim, action_dim, self.seed))
+        size = self.prior.n_features + 1
+        self.hold(heads=np.zeros((n, action_dim, size), dtype=np.float32), score_moments=np.zeros((n, size, size)))
+        experts, rows = self._no_experts(self.n_experts or n)
+        self.hold(experts=experts, mixture_rows=rows)
+        if self.adapt == "advantage":
+            offline, recent = ({"gram": np.zeros((n, size, size)), "cross": np.zeros((n, size, action_dim))} for _ in range(2))
+            self.hold(offline_statistics=offline, recent_statistics={**recent, "weight": np.zeros(n)})
+        if self.uses_dice:
+            self.hold(dice=DiceValue(n, obs_dim, self.pretraining_config.dice_width).requires_grad_(False))
+            if self.calibrate:
+                self.hold(dice_scale=np.tile([1.0, 0.0], (n, 1)), calibrated=np.zeros(n, dtype=bool))
+
+    def _no_experts(self, n_experts: int) -> tuple[np.ndarray, np.ndarray]:
+        """Experts and rows of clients that have received none."""
+        shape = self.n_clients, n_experts
+        return np.full((*shape, *self.prior.head_shape), np.nan, np.float32), np.full(shape, np.nan, np.float32)
 
     def upload(self, index: int) -> Payload:
         payload: Payload = {HEAD: self.heads[index]}
-        if self.cost == "score" and self.experts is not None:
+        if self.cost == "score" and not np.isnan(self.experts[index]).all():
             row = score_cost(self.heads[index], self.experts[index], self.score_moments[index])
             payload[COST_ROW] = row.astype(np.float32)
         return payload
 
     def receive(self, index: int, broadcast: Payload) -> None:
-        if self.experts is None:
-            self.experts = np.zeros((self.n_clients, *broadcast[EXPERTS].shape), dtype=np.float32)
-            self.mixture_rows = np.full((self.n_clients, len(broadcast[EXPERTS])), np.nan, dtype=np.float32)
+        if len(broadcast[EXPERTS]) != self.experts.shape[1]:  # a site does not know how many the server has
+            self.experts, self.mixture_rows = self._no_experts(len(broadcast[EXPERTS]))
         self.experts[index] = broadcast[EXPERTS]
         if MIXTURE_ROW in broadcast:
             self.mixture_rows[index] = broadcast[MIXTURE_ROW]
@@ -121,29 +153,13 @@ class FedGuide(FederatedPPO):
         fitted = stage.prior()
         self.prior = fitted.prior
         self.pretraining_bytes = (fitted.bytes_up * self.n_clients, fitted.bytes_down * self.n_clients)
-        self.heads = fitted.heads  # psi_i, (n_clients, action_dim, p + 1)
-        self.score_moments = fitted.moments  # S_i of the score cost; stay with their client
-        if self.adapt == "advantage":
-            self.adaptation = HeadAdaptation(fitted.statistics, self.adapt_weight, self.adapt_temperature)
+        self.heads, self.score_moments = fitted.heads, fitted.moments
+        if self.offline_statistics is not None:
+            for i, statistics in enumerate(fitted.statistics):
+                for name, array in self.offline_statistics.items():
+                    array[i] = getattr(statistics * (1.0 / statistics.weight), name)
         if self.uses_dice:
             self.dice = stage.dice()
-
-    def save_state(self) -> State:
-        modules = {name: module and to_arrays(module.state_dict()) for name, module in self._frozen_modules().items()}
-        adaptation = self.adaptation and self.adaptation.save_state()
-        return {**super().save_state(), "parts": offline_parts(self), "modules": modules, "adaptation": adaptation}
-
-    def load_state(self, state: State) -> None:
-        begin_parts(self, state["parts"], state["attributes"]["pretrained"])
-        for name, module in self._frozen_modules().items():
-            if module is not None:
-                module.load_state_dict(to_tensors(state["modules"][name]))
-        if self.adaptation is not None:
-            self.adaptation.load_state(state["adaptation"])
-        super().load_state(state)
-
-    def _frozen_modules(self) -> dict[str, th.nn.Module | None]:
-        return {"prior": self.prior, "dice": self.dice}
 
     def _compute_advantages(
         self, last_values: np.ndarray, truncation_values: np.ndarray, last_raw_obs: np.ndarray, dones: np.ndarray
@@ -158,8 +174,7 @@ class FedGuide(FederatedPPO):
         )
         returns = buffer.rows(monte_carlo)
         raw = buffer.rows(buffer.raw_observations)
-        self._begin_calibration()
-        if self.dice_scale is not None:
+        if self.dice_scale is not None and self.calibrated is not None:
             for i in np.flatnonzero(self.present & ~self.calibrated).tolist():
                 std = self.normalizer.reward_std[i]
                 self.dice_scale[i] = calibrate(self.dice.client_values(i, raw[i]) / std, returns[i])
@@ -195,15 +210,6 @@ class FedGuide(FederatedPPO):
         for index in np.flatnonzero(self.present):
             for name in ("residual_correlation", "explained_variance_dice"):
                 self.record_client(self.client_ids[index], name, float(figures[name][index]))
-
-    def complete_state(self) -> None:
-        super().complete_state()
-        self._begin_calibration()
-
-    def _begin_calibration(self) -> None:
-        if self.dice is not None and self.calibrate and self.dice_scale is None:
-            self.dice_scale = np.tile([1.0, 0.0], (self.n_clients, 1))
-            self.calibrated = np.zeros(self.n_clients, dtype=bool)
 
     def _dice_values(self, index: int, raw_obs: np.ndarray) -> np.ndarray:
         """V_phi of one client at raw observations ``(batch, obs_dim)``, in the scale of its rewards, ``(batch,)``."""
@@ -241,7 +247,6 @@ class FedGuide(FederatedPPO):
 
     def _prepare_importance_weights(self) -> None:
         """Self-normalised weights of the rollout's actions under the mixture, with mean one over the whole rollout."""
-        assert self.prior is not None and self.experts is not None
         buffer = self.rollout_buffer
         raw, actions = buffer.rows(buffer.raw_observations), buffer.rows(buffer.actions)
         policy_log_probs = buffer.rows(buffer.log_probs)
@@ -265,7 +270,6 @@ class FedGuide(FederatedPPO):
 
     def _prepare_prior_actions(self) -> None:
         """One action per visited state from the mixture."""
-        assert self.prior is not None and self.experts is not None
         raw = self.rollout_buffer.rows(self.rollout_buffer.raw_observations)
         drawn = th.zeros(self.n_clients, self.rollout_buffer.n_rows, self.action_space.shape[0])  # type: ignore[index]
         for i, rng in self.present_streams(Role.PRIOR):
@@ -295,31 +299,23 @@ class FedGuide(FederatedPPO):
         return [*super()._excluded_save_params(), "_old_log_std"]
 
     def _finish_training(self) -> None:
-        if self.adaptation is None:
+        if self.offline_statistics is None or self.recent_statistics is None:
             return
-        assert self.prior is not None
         buffer = self.rollout_buffer
         raw, advantages = buffer.rows(buffer.raw_observations), buffer.rows(buffer.advantages)
         executed = np.clip(buffer.rows(buffer.actions), self.action_space.low, self.action_space.high)  # type: ignore
         moved = np.zeros(self.n_clients)
         for i, rng in self.present_streams(Role.HEAD):
-            head = self.adaptation.refit(self.prior, i, raw[i], executed[i], advantages[i], rng)
+            offline = HeadStatistics(**{name: array[i] for name, array in self.offline_statistics.items()}, weight=1.0)
+            recent = HeadStatistics(**{name: array[i] for name, array in self.recent_statistics.items()})
+            head, recent = refit_head(
+                self.prior, offline, recent, self.adapt_weight, self.adapt_temperature, raw[i], executed[i], advantages[i], rng
+            )
+            for name, array in self.recent_statistics.items():
+                array[i] = getattr(recent, name)
             moved[i] = np.linalg.norm(head - self.heads[i]) / np.linalg.norm(self.heads[i])
             self.heads[i] = head
         self.logger.record("prior/head_change", float(moved[self.present].mean()))
-
-    def parameter_parts(self) -> list[str]:
-        return offline_parts(self)
-
-    def begin_parts(self, parts: Sequence[str], pretrained: bool) -> None:
-        begin_parts(self, parts, pretrained)
-
-    def parameter_arrays(self) -> dict[str, np.ndarray]:
-        return {**super().parameter_arrays(), **part_arrays(self)}
-
-    def set_parameter_arrays(self, arrays: dict[str, np.ndarray]) -> None:
-        super().set_parameter_arrays(arrays)
-        set_part_arrays(self, arrays)
 
 
 class FedGuideP(FedGuide):

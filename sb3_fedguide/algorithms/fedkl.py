@@ -44,7 +44,6 @@ class FedKL(AnchoredFedAvg):
 
     @th.no_grad()
     def _prepare_training(self) -> None:
-        super()._prepare_training()
         buffer = self.rollout_buffer
         observations = th.as_tensor(buffer.rows(buffer.observations), device=self.device)
         if self.lambda_global > 0:

@@ -26,22 +26,15 @@ class AnchoredFedAvg(FedAvg):
         self.anchor: Parameters = {}  # theta_bar as each client last received it
         super().__init__(**vars(given))
 
+    def _begin_learning(self, environments_were_reset: bool) -> None:
+        super()._begin_learning(environments_were_reset)
+        if not self.anchor:
+            self.anchor = snapshot(self.policy, self.averaged_prefixes)
+
     def receive(self, index: int, broadcast: Payload) -> None:
-        self._initialize_anchor()
         super().receive(index, broadcast)
         for name, array in broadcast.items():
             self.anchor[name][index] = array
-
-    def complete_state(self) -> None:
-        super().complete_state()
-        self._initialize_anchor()
-
-    def _prepare_training(self) -> None:
-        self._initialize_anchor()
-
-    def _initialize_anchor(self) -> None:
-        if not self.anchor:
-            self.anchor = snapshot(self.policy, self.averaged_prefixes)
 
 
 class FedProx(AnchoredFedAvg):
@@ -65,7 +58,6 @@ class FedProx(AnchoredFedAvg):
         super().__init__(**given.of(FedAvgArguments))
 
     def _prepare_training(self) -> None:
-        super()._prepare_training()
         self._anchor_tensors = {name: th.as_tensor(array, device=self.device) for name, array in self.anchor.items()}
 
     def _extra_losses(self, data: FederatedSamples, mean: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:

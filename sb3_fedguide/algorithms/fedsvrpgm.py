@@ -39,6 +39,10 @@ class FedSVRPGM(FedAvg):
     """
 
     state_attributes = ("reference", "reference_period", "momentum", "directions")
+    reference: Parameters  # theta_ref of each client
+    reference_period: np.ndarray  # when each took it, counted in periods of `reference_every` rounds
+    momentum: Parameters  # u_r as each client last received it
+    directions: Parameters  # each client's mean u of the last round
 
     @takes(FedSVRPGMArguments)
     def __init__(self, given: FedSVRPGMArguments) -> None:
@@ -46,10 +50,6 @@ class FedSVRPGM(FedAvg):
             raise ValueError("FedSVRPG-M shares the actors' directions, and average='critic' no actor; use 'all' or 'actor'")
         self.beta = given.beta
         self.reference_every = given.reference_every
-        self.reference: Parameters = {}  # theta_ref of each client
-        self.reference_period = np.zeros(0, dtype=int)  # when each took it, counted in periods of `reference_every` rounds
-        self.momentum: Parameters = {}  # u_r as each client last received it
-        self.directions: Parameters = {}  # each client's mean u of the last round
         self._reference_actor: StackedActor | None = None
         self._reference_tensors: dict[str, th.Tensor] = {}
         self._momentum_tensors: dict[str, th.Tensor] = {}
@@ -57,11 +57,11 @@ class FedSVRPGM(FedAvg):
         self._n_directions = 0
         super().__init__(**given.of(FedAvgArguments))
 
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        if not self.momentum:  # otherwise they come from a saved model
-            self.momentum = {name: np.zeros_like(array) for name, array in snapshot(self.policy, ACTOR_PREFIXES).items()}
-            self.directions = {name: array.copy() for name, array in self.momentum.items()}
+    def _setup_state(self) -> None:
+        actors = snapshot(self.policy, ACTOR_PREFIXES)
+        zeros, more_zeros = ({name: np.zeros_like(array) for name, array in actors.items()} for _ in range(2))
+        self.hold(reference=actors, reference_period=np.full(self.n_clients, -1), momentum=zeros, directions=more_zeros)
+        super()._setup_state()  # looks at what is uploaded
 
     def upload(self, index: int) -> Payload:
         """Parameters and number of samples as in FedAvg, and ``direction.<actor parameter>``."""
@@ -88,18 +88,9 @@ class FedSVRPGM(FedAvg):
         self._n_directions = 0
         self._record_ratios()
 
-    def complete_state(self) -> None:
-        super().complete_state()
-        self._begin_references()
-
-    def _begin_references(self) -> None:
-        if not self.reference:
-            self.reference, self.reference_period = snapshot(self.policy, ACTOR_PREFIXES), np.full(self.n_clients, -1)
-
     def _refresh_references(self) -> None:
         """Clients that were away when the others took a new reference take theirs when they are back."""
         current = snapshot(self.policy, ACTOR_PREFIXES)
-        self._begin_references()
         period = self.round // self.reference_every
         due = (self.reference_period != period) | (self.round % self.reference_every == 0)
         for index in np.flatnonzero(due & self.present):

@@ -85,7 +85,6 @@ class Priors:
 
 def priors(model: FedGuide, points: np.ndarray) -> Priors:
     """The priors of a trained federation at points ``(n_points, 2)``."""
-    assert model.prior is not None and model.experts is not None
     obs = th.zeros(len(points), model.observation_space.shape[0])  # type: ignore[index]
     actions = th.as_tensor(points, dtype=th.float32)
     own = [model.prior.log_prob(head, obs, actions).exp().numpy() for head in model.heads]

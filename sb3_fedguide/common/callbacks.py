@@ -11,9 +11,10 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 from tqdm.auto import tqdm
 
-from fed_envs.state import State, declared_state, load_declared
+from fed_envs.state import State
 from sb3_fedguide.common.digits import shown
 from sb3_fedguide.server.rounds import Coordinator
+from sb3_fedguide.state.held import load_held, save_held
 
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
@@ -32,11 +33,11 @@ class RoundCallback(BaseCallback):
 
     def save_state(self) -> State:
         """What a checkpoint has to know of this callback, as plain data."""
-        return declared_state(self)
+        return save_held(self)
 
     def load_state(self, state: State) -> None:
         """Go on from what :meth:`save_state` returned, before the training starts."""
-        load_declared(self, state)
+        load_held(self, state)
 
     def _on_step(self) -> bool:
         return True

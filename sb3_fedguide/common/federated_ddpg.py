@@ -15,7 +15,6 @@ from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
 from fed_envs import FederatedVecEnv
-from fed_envs.state import State
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy, check_ddpg_actions
 from sb3_fedguide.common.ddpg_settings import check_settings
 from sb3_fedguide.common.environments import as_federated_env
@@ -32,6 +31,7 @@ from sb3_fedguide.seeding import Role, integer_seed
 from sb3_fedguide.settings.arguments import FederatedDDPGArguments
 from sb3_fedguide.settings.ranges import check_values
 from sb3_fedguide.settings.signatures import takes, types_of
+from sb3_fedguide.state.held import Held
 
 
 class FederatedDDPG(Federation, DDPG):
@@ -82,7 +82,7 @@ class FederatedDDPG(Federation, DDPG):
     replay_buffer: FederatedReplayBuffer | None  # type: ignore[assignment]
     policy: StackedDDPGPolicy
     train_freq: int
-    state_attributes: ClassVar[tuple[str, ...]] = ("client_steps",)
+    state_attributes: ClassVar[tuple[str | Held, ...]] = ("client_steps", "noise.state", "replay_buffer")
 
     @takes(FederatedDDPGArguments)
     def __init__(self, given: FederatedDDPGArguments) -> None:
@@ -149,6 +149,7 @@ class FederatedDDPG(Federation, DDPG):
         )
         self._fit_copies()
         self._start_server()
+        self._setup_state()
 
     def _fit_copies(self) -> None:
         assert self.replay_buffer is not None
@@ -337,16 +338,6 @@ class FederatedDDPG(Federation, DDPG):
         clients = super().begin_lost_episodes()
         self.noise.reset(ended.reshape(self.n_clients, self.n_envs_per_client))
         return clients
-
-    def save_state(self) -> State:
-        assert self.replay_buffer is not None
-        return {**super().save_state(), "noise": self.noise.state.copy(), "replay_buffer": self.replay_buffer.save_state()}
-
-    def load_state(self, state: State) -> None:
-        assert self.replay_buffer is not None
-        super().load_state(state)
-        self.noise.state = state["noise"].copy()
-        self.replay_buffer.load_state(state["replay_buffer"])
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_statistics"]

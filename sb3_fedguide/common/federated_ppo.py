@@ -146,6 +146,7 @@ class FederatedPPO(Federation, PPO):
         )
         self._fit_copies()
         self._start_server()
+        self._setup_state()
 
     def _fit_copies(self) -> None:
         check_sizes(self.rollout_size, self.batch_size, self.n_envs_per_client)

@@ -120,7 +120,9 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
         env.active = np.repeat(self.present, self.n_envs_per_client)
         if self.partial:
             for optimizer in self._optimizers():
-                optimizer.present = self.present  # type: ignore[attr-defined]
+                assert isinstance(optimizer, ParticipationAdam)
+                optimizer.present = self.present
+                optimizer.make_state()
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
         """Everything that steps stacked parameters."""
@@ -137,17 +139,6 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
             assert self.seed is not None
             self._streams[role] = [stream(self.seed, role, client) for client in self.client_ids]
         return self._streams[role]
-
-    def complete_state(self) -> None:
-        """Make what a client gets when it first trains, for all clients: none then differs from the others in kind.
-
-        It changes nothing that they will do.
-        """
-        for role in Role:
-            self.streams(role)
-        for optimizer in self._optimizers():
-            if isinstance(optimizer, ParticipationAdam):
-                optimizer.make_state()
 
     def learn(
         self: SelfFederation,

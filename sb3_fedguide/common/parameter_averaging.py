@@ -15,6 +15,7 @@ from sb3_fedguide.server.averaging import averaged_prefixes, averaging_is_due, p
 from sb3_fedguide.server.strategy import N_SAMPLES, Payload
 from sb3_fedguide.settings.arguments import AveragingArguments
 from sb3_fedguide.settings.signatures import adds
+from sb3_fedguide.state.held import Held
 
 
 class ParameterAveraging(Federation):
@@ -44,7 +45,7 @@ class ParameterAveraging(Federation):
     All other parameters are those of the learner, :class:`FederatedPPO` or :class:`FederatedDDPG`.
     """
 
-    state_attributes: ClassVar[tuple[str, ...]] = ("screening_state", "privacy_state", "known_parameters")
+    state_attributes: ClassVar[tuple[str | Held, ...]] = ("screening_state", "privacy_state", "known_parameters")
 
     @adds(AveragingArguments)
     def __init__(self, given: AveragingArguments, *args: Any, **learner: Any) -> None:
@@ -58,7 +59,7 @@ class ParameterAveraging(Federation):
         self.server_momentum = given.server_momentum
         self.mix = given.mix
         self.screening = given.screening
-        #: see :attr:`Screening.state`; empty until the first test or without tests
+        #: see :meth:`Screening.begin`; empty without tests
         self.screening_state: dict[str, np.ndarray] = {}
         self._tests = Screening(self)
         self.noise_multiplier = given.noise_multiplier
@@ -72,8 +73,9 @@ class ParameterAveraging(Federation):
         self._shares: dict[int, float] = {}
         super().__init__(*args, **learner)
 
-    def _setup_model(self) -> None:
-        super()._setup_model()  # type: ignore[safe-super]  # the learner's
+    def _setup_state(self) -> None:
+        super()._setup_state()
+        self._tests.begin()
         self._privacy.begin()
 
     def _identity(self) -> dict[str, Any]:
@@ -142,15 +144,10 @@ class ParameterAveraging(Federation):
         """The share that clients take now, in [0, 1]."""
         return min(1.0, max(0.0, self.mix(self._current_progress_remaining))) if callable(self.mix) else self.mix
 
-    def complete_state(self) -> None:
-        super().complete_state()
-        if self.screening:
-            self._tests.begin()
-
     def test_work(self) -> np.ndarray | None:
         if not self.screening:
             return None
-        untimed = self._tests.begin()["untimed"]
+        untimed = self.screening_state["untimed"]
         work = untimed / self.rollout_size
         untimed[:] = 0
         return work

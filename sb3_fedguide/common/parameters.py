@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +17,17 @@ from torch import nn
 from fed_envs.files import atomic_file
 from sb3_fedguide.common.export import SETTINGS, ClientPolicies, ClientPolicy, Normalization, client_settings
 from sb3_fedguide.common.normalization import Normalize
+from sb3_fedguide.common.resumable import Resumable
 from sb3_fedguide.common.spaces import describe_space, space_from
 from sb3_fedguide.state.array_files import array_mismatches, read_arrays, take_prefix, write_arrays
+from sb3_fedguide.state.held import Held, file_arrays, held_by
 from sb3_fedguide.state.stacked import client_state, to_arrays, to_tensors
 
 FORMAT, VERSION = "sb3_fedguide parameters", 1
 HEADER = "header"
 
 
-class ParameterFiles(ClientPolicies):
+class ParameterFiles(ClientPolicies, Resumable):
     """Mixin for federations: their parameters as a file of plain arrays, beside SB3's archive."""
 
     normalize: Normalize
@@ -60,19 +61,6 @@ class ParameterFiles(ClientPolicies):
         """
         _read(self, path)
 
-    def parameter_parts(self) -> list[str]:
-        """What an exported file of this model holds beside policies and normalisation."""
-        return []
-
-    def begin_parts(self, parts: Sequence[str], pretrained: bool) -> None:
-        """Set up the parts that a file holds, before :meth:`set_parameter_arrays`.
-
-        :param pretrained: whether the file's model had been through the offline stage
-        :raises ValueError: for parts that this model does not have
-        """
-        if parts:
-            raise ValueError(f"the file holds {', '.join(sorted(parts))}, which this method has not")
-
     def acting_arrays(self) -> dict[str, np.ndarray]:
         """Copies of what decides how all clients act and the exchange may change: the policies under their parameters' names,
         and shared observation statistics under ``normalizer/``."""
@@ -86,18 +74,43 @@ class ParameterFiles(ClientPolicies):
         self.policy.load_state_dict({**self.policy.state_dict(), **to_tensors(policy)})
         self.normalizer.load_state_dict(to_tensors(take_prefix(arrays, "normalizer/")), strict=False)
 
-    def parameter_arrays(self) -> dict[str, np.ndarray]:
-        """Copies of everything learned, by name."""
+    def parameter_arrays(self, parts: Collection[str] | None = None) -> dict[str, np.ndarray]:
+        """Copies of everything learned, by name.
+
+        :param parts: which of its parts, whatever is in them; those that are complete if ``None``
+        """
         policy = to_arrays(self.policy.state_dict(), "policy/")
         statistics = to_arrays(self.normalizer.state_dict(), "normalizer/")
         of_one_round = ("normalizer/returns", "normalizer/round_obs.")
         kept = {name: array for name, array in statistics.items() if not name.startswith(of_one_round)}
-        return {**policy, **kept}
+        chosen = _complete_parts(self) if parts is None else parts
+        held = [file_arrays(self, held) for held in _exported(self) if held.part in chosen]
+        return {**policy, **kept, **{name: array.copy() for arrays in held for name, array in arrays.items()}}
 
-    def set_parameter_arrays(self, arrays: dict[str, np.ndarray]) -> None:
-        """Take arrays named as in :meth:`parameter_arrays`, which fit."""
-        self.policy.load_state_dict(to_tensors(take_prefix(arrays, "policy/")))
-        self.normalizer.load_state_dict(to_tensors(take_prefix(arrays, "normalizer/")), strict=False)
+
+def _exported(model: ParameterFiles) -> list[Held]:
+    """What this model's files hold beside policies and normalisation, once it has been through the offline stage."""
+    return [held for held in held_by(model).values() if held.part and getattr(model, held.name, None) is not None]
+
+
+def _complete_parts(model: ParameterFiles) -> list[str]:
+    """The parts that there are at the moment."""
+    exported = _exported(model) if model.pretrained else []
+    waiting = {
+        held.part
+        for held in exported
+        if held.later and any(np.isnan(array).any() for array in file_arrays(model, held).values())
+    }
+    return list(dict.fromkeys(held.part for held in exported if held.part not in waiting))
+
+
+def _part_differences(model: ParameterFiles, header: dict[str, Any]) -> list[str]:
+    """How the parts of a file are not those of this model with its settings."""
+    own = {held.part: held.later for held in _exported(model)} if header["pretrained"] else {}
+    unknown = sorted(set(header["parts"]) - own.keys())
+    missing = sorted(part for part, later in own.items() if not later and part not in header["parts"])
+    lines = [f"the file holds {', '.join(unknown)}, which this method has not with its settings"] if unknown else []
+    return [*lines, f"the file holds no {', '.join(missing)}, which this model with its settings needs"] if missing else lines
 
 
 def _write(model: ParameterFiles, path: str | Path) -> None:
@@ -107,7 +120,7 @@ def _write(model: ParameterFiles, path: str | Path) -> None:
     """
     header = {
         "format": FORMAT, "version": VERSION, "algorithm": type(model).__name__, "pretrained": model.pretrained,
-        "parts": model.parameter_parts(), **_identity(model), **_outside(model),
+        "parts": _complete_parts(model), **_identity(model), **_outside(model),
     }  # fmt: skip
     write_arrays(Path(path), {HEADER: np.array(json.dumps(header, allow_nan=False)), **model.parameter_arrays()})
 
@@ -124,20 +137,22 @@ def _read(model: ParameterFiles, path: str | Path) -> None:
         for name, value in _identity(model).items()
         if header.get(name) != value
     ]
-    if not differences:
-        blank = copy.copy(model)  # shallow: what is set on it leaves the model alone
-        try:
-            blank.begin_parts(header["parts"], header["pretrained"])
-        except ValueError as error:
-            raise ValueError(f"{path} does not fit this {type(model).__name__}: {error}") from None
-        differences = array_mismatches(arrays, blank.parameter_arrays()) or _broken(arrays)
+    differences = differences or _part_differences(model, header)
+    differences = differences or array_mismatches(arrays, model.parameter_arrays(header["parts"])) or _broken(arrays)
     if differences:
         raise ValueError(
             f"{path} does not fit this {type(model).__name__}: {'; '.join(differences)}; for its policies alone, without a "
             "federation, there is 'fedguide export'"
         )
-    model.begin_parts(header["parts"], header["pretrained"])
-    model.set_parameter_arrays(arrays)
+    model.policy.load_state_dict(to_tensors(take_prefix(arrays, "policy/")))
+    model.normalizer.load_state_dict(to_tensors(take_prefix(arrays, "normalizer/")), strict=False)
+    for held in _exported(model):
+        vars(model).pop(held.name)
+    model._setup_state()
+    for held in _exported(model):
+        if held.part in header["parts"]:
+            for name, array in file_arrays(model, held).items():
+                array[...] = arrays[name]
     model.pretrained = header["pretrained"]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -12,15 +12,19 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from fed_envs import FederatedVecEnv
-from fed_envs.state import State, declared_state, freeze, load_declared, thaw
+from fed_envs.state import State, freeze, thaw
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointError, newest_checkpoint
 from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.server.delays import Delays
 from sb3_fedguide.server.strategy import Strategy
 from sb3_fedguide.state.array_files import array_mismatches
+from sb3_fedguide.state.held import Held, load_held, save_held
 from sb3_fedguide.state.optimizer_state import load_optimizer, optimizer_state
 from sb3_fedguide.state.stacked import to_arrays, to_tensors
+
+#: Entries of a federation's state that belong to no client.
+SHARED_ENTRIES = frozenset({"identity", "shared", "strategy", "random"})
 
 SelfResumable = TypeVar("SelfResumable", bound="Resumable")
 
@@ -29,18 +33,15 @@ class Resumable(BaseAlgorithm):
     """Mixin of a federation that gives and takes its state between two rounds.
 
     A new object with the same settings that takes the state goes on bit for bit like the one that gave it. What an
-    algorithm adds to the state is either named in its own ``state_attributes`` or given by :meth:`save_state`.
+    algorithm adds to the state is named in its own ``state_attributes``, and nowhere else.
     """
 
-    #: attributes that change while it trains and are plain data (see :func:`fed_envs.state.freeze`); those of the base
-    #: classes are added
-    state_attributes: ClassVar[tuple[str, ...]] = (
+    #: attributes that change while it trains, by name or as :class:`Held`; those of the base classes are added
+    state_attributes: ClassVar[tuple[str | Held, ...]] = (
         "seed", "num_timesteps", "round", "_n_updates", "_episode_num", "_current_progress_remaining", "pretrained",
         "pretraining_bytes", "present", "outdated", "has_trained", "test_steps", "episode_infos", "_streams", "_last_obs",
         "_last_episode_starts",
     )  # fmt: skip
-    #: entries of the state without one entry per client, as paths (``"modules.prior"``); those of base classes are added
-    shared_state: ClassVar[tuple[str, ...]] = ("identity", "random", "strategy")
     #: simulated time, see :func:`sb3_fedguide.common.participation.simulate_delays`; none if ``None``
     delays: Delays | None = None
     normalizer: FederatedNormalizer
@@ -66,6 +67,15 @@ class Resumable(BaseAlgorithm):
             "rollout_size": self.rollout_size,
         }
 
+    def _setup_state(self) -> None:
+        """Begin to hold what a new model of this method holds, in its shapes: the last of what ``_setup_model()`` does."""
+
+    def hold(self, **values: Any) -> None:
+        """Begin to hold ``values``, by attribute, unless they came with a saved model: for :meth:`_setup_state`."""
+        for name, value in values.items():
+            if getattr(self, name, None) is None:
+                setattr(self, name, value)
+
     def save_state(self) -> State:
         """Policies, optimisers, server, normalisation, random streams, environments and counters; only between two rounds.
 
@@ -73,7 +83,8 @@ class Resumable(BaseAlgorithm):
         """
         state: State = {
             "identity": self._identity(),
-            "attributes": declared_state(self),
+            "attributes": save_held(self),
+            "shared": save_held(self, shared=True),
             "policy": to_arrays(self.policy.state_dict()),
             "optimizers": [optimizer_state(optimizer) for optimizer in self._optimizers()],
             "normalizer": to_arrays(self.normalizer.state_dict()),
@@ -82,7 +93,7 @@ class Resumable(BaseAlgorithm):
             # Nothing here draws from the processes' own generators; a user's environment or algorithm may.
             "random": {"torch": th.get_rng_state().numpy().copy(), "numpy": freeze(np.random.get_state())},
         }
-        forgotten = self._forgotten(state["attributes"])
+        forgotten = self._forgotten(state["attributes"].keys() | state["shared"].keys())
         if forgotten:
             raise ValueError(
                 f"{type(self).__name__} keeps arrays in {', '.join(forgotten)}, which no checkpoint would hold: name them in "
@@ -101,7 +112,7 @@ class Resumable(BaseAlgorithm):
         mismatches = array_mismatches(state["policy"], to_arrays(self.policy.state_dict()))
         if mismatches:
             raise ValueError(f"the state's policies do not fit: {mismatches[0]}")
-        load_declared(self, state["attributes"])
+        load_held(self, {**state["attributes"], **state["shared"]})
         self.policy.load_state_dict(to_tensors(state["policy"]))
         for optimizer, saved in zip(self._optimizers(), state["optimizers"], strict=True):
             load_optimizer(optimizer, saved)
@@ -173,7 +184,7 @@ class Resumable(BaseAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_callback_states"]
 
-    def _forgotten(self, saved: State) -> list[str]:
+    def _forgotten(self, saved: Collection[str]) -> list[str]:
         """Attributes with arrays that are neither saved nor said to be transient."""
         transient = set(self._excluded_save_params())
         return [

@@ -43,28 +43,29 @@ class Screening:
         self.model = model
         self._env: FederatedVecEnv | None = None
 
-    def begin(self) -> dict[str, np.ndarray]:
-        """Per client, ``(n_clients,)``: whether it is alone, the steps of its tests (and of those without simulated time yet),
+    def begin(self) -> None:
+        """Lay out ``screening_state``, unless it was loaded.
+
+        Per client, ``(n_clients,)``: whether it is alone, the steps of its tests (and of those without simulated time yet),
         the round of its next one, and the rounds that it then waits."""
         state, n_clients = self.model.screening_state, self.model.n_clients
-        if not state:
+        if self.model.screening and not state:
             state["alone"] = np.zeros(n_clients, dtype=bool)
             state["steps"] = np.zeros(n_clients, dtype=int)
             state["untimed"] = np.zeros(n_clients, dtype=int)
             state["next_round"] = np.full(n_clients, FIRST_ROUND)
             state["wait"] = np.ones(n_clients, dtype=int)
-        return state
 
     def is_alone(self, index: int) -> bool:
         """Whether the client at position ``index`` has left what the others share."""
-        return bool(self.model.screening > 0 and self.begin()["alone"][index])
+        return bool(self.model.screening > 0 and self.model.screening_state["alone"][index])
 
     def refused(self, candidates: Mapping[int, Payload]) -> set[int]:
         """The clients that do not take what they were sent, after the tests that are due.
 
         :param candidates: by position, the parameters that a client would then have
         """
-        model, state = self.model, self.begin()
+        model, state = self.model, self.model.screening_state
         episodes = {index: self._affordable(index) for index in candidates}
         episodes = {index: n for index, n in episodes.items() if n > 0 and model.round >= state["next_round"][index]}
         for index, (own, other) in self._test(candidates, episodes).items():
@@ -83,7 +84,7 @@ class Screening:
 
     def _affordable(self, index: int) -> int:
         """Episodes of either policy for which the client has steps left; 0 for none."""
-        model, state = self.model, self.begin()
+        model, state = self.model, self.model.screening_state
         lengths = [info["l"] for info in model.episode_infos[index]]
         if not lengths or not model.has_trained[index]:
             return 0
@@ -121,7 +122,7 @@ class Screening:
                 model.policy.load_client(index, parameters)
             steps = np.where(active, tested.lengths, 0).sum(axis=1)
             for name in ("steps", "untimed"):
-                self.begin()[name][:] += steps
+                model.screening_state[name][:] += steps
             model.test_steps += int(steps.sum())
             results.append(tested.returns)
         return {index: (results[0][index, :n], results[1][index, :n]) for index, n in episodes.items()}

@@ -14,7 +14,9 @@ from fed_envs.state import State
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.faults import warn_of_new_episodes
 from sb3_fedguide.common.federation import Federation
+from sb3_fedguide.common.resumable import SHARED_ENTRIES
 from sb3_fedguide.engines.worker import Round, Trained, describe
+from sb3_fedguide.seeding import Role
 from sb3_fedguide.state.client_axis import join_clients, take_clients
 
 
@@ -94,7 +96,8 @@ class Engine(ABC):
         """
         _check_callbacks(callbacks)
         callbacks.on_rollout_start()
-        model.complete_state()  # an absent group's is joined with those of the others
+        for role in Role:
+            model.streams(role)  # those that a client has not drawn from yet are joined with those of the others
         state = model.save_state()
         steps_at_once = model._active_steps(model._federated_env())
         parts = {k: _part(model, state, group) for k, group in enumerate(self.groups)}
@@ -125,10 +128,10 @@ class Engine(ABC):
         parts = [parts[trained], *parts[:trained], *parts[trained + 1 :]]  # shared entries are the first part's
         groups = [self.groups[trained], *self.groups[:trained], *self.groups[trained + 1 :]]
         order = [position for group in groups for position in group]
-        joined = join_clients(parts, shared_entries(model))
+        joined = join_clients(parts, SHARED_ENTRIES)
         # Gradient steps that any client took part in: in each round, who begins later takes part until the end.
         joined["attributes"]["_n_updates"] = max(part["attributes"]["_n_updates"] for part in parts)
-        joined = take_clients(joined, np.argsort(order).tolist(), model.n_clients, shared_entries(model))
+        joined = take_clients(joined, np.argsort(order).tolist(), model.n_clients, SHARED_ENTRIES)
         # What belongs to the process and the server has not changed.
         model.load_state({**joined, **{name: state[name] for name in ("identity", "strategy", "random")}})
 
@@ -145,13 +148,8 @@ class Engine(ABC):
             model.logger.record(key, _combined(key, entries), exclude=excluded[key])
 
 
-def shared_entries(model: Federation) -> set[str]:
-    """Entries of its state that belong to no client."""
-    return {name for kind in type(model).__mro__ for name in vars(kind).get("shared_state", ())}
-
-
 def _part(model: Federation, state: State, group: Sequence[int]) -> State:
-    part = take_clients(state, group, model.n_clients, shared_entries(model))
+    part = take_clients(state, group, model.n_clients, SHARED_ENTRIES)
     clients = [model.client_ids[position] for position in group]
     return {**part, "identity": {**state["identity"], "clients": clients}, "strategy": None}
 

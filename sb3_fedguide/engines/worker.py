@@ -16,6 +16,7 @@ from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
 from fed_envs.state import State
 from sb3_fedguide.common.federation import Federation
+from sb3_fedguide.state.held import held_by
 
 
 class Round(NamedTuple):
@@ -99,10 +100,7 @@ def describe(model: Federation, positions: Sequence[int]) -> bytes:
     env = model._federated_env()
     source = env.family if env.family is not None else env._factories
     per_round = {*model._excluded_save_params(), "strategy", "present", "outdated", "_last_obs", "_last_episode_starts"}
-    learned = {name for kind in type(model).__mro__ for name in vars(kind).get("state_attributes", ())} - {
-        "seed",
-        "pretrained",
-    }
+    learned = held_by(model).keys() - {"seed", "pretrained"}
     attributes = {
         name: value
         for name, value in vars(model).items()

@@ -91,7 +91,6 @@ def compare_costs(param: np.ndarray, score: np.ndarray, scaling: str = "max") ->
 
 def cost_proxy(model: FedGuide) -> CostProxy:
     """Costs of ``cost: param`` against those of ``cost: score``, between the clients' heads and the experts they last got."""
-    assert model.experts is not None
     clients = np.flatnonzero(model.present)
     param = np.concatenate([head_costs(model.heads[i, None], model.experts[i]) for i in clients])
     score = np.stack([score_cost(model.heads[i], model.experts[i], model.score_moments[i]) for i in clients])

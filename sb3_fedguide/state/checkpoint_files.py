@@ -19,7 +19,7 @@ from sb3_fedguide.state.array_files import read_arrays, write_arrays
 #: How many checkpoints stay: the newest may turn out to be damaged.
 KEPT = 2
 #: Raised whenever what a checkpoint holds changes, so that another version's is refused.
-FORMAT = 2
+FORMAT = 3
 _JSON = "state.json"
 _NAME = re.compile(r"round_(\d+)\.npz")
 

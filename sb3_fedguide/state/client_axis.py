@@ -1,8 +1,7 @@
 """A federation's state for some of its clients, and of several such parts in one.
 
 What :meth:`Federation.save_state` returns has a client axis everywhere: the first of arrays and lists. Where a client has
-several environments, it may have as many neighbouring entries. What belongs to no client is named by the algorithm's classes
-in ``shared_state``.
+several environments, it may have as many neighbouring entries. What belongs to no client the algorithm declares as shared.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ def take_clients(state: State, positions: Sequence[int], n_clients: int, shared:
     """The part of the clients at ``positions``.
 
     :param state: of ``n_clients`` clients
-    :param shared: paths of entries that belong to no client, such as ``"modules.prior"``
+    :param shared: entries that belong to no client, such as ``"random"``
     :raises ValueError: for an entry without a client axis that is not said to be shared
     """
 
@@ -86,6 +85,6 @@ def _rows(value: np.ndarray | list[Any], path: str, n_clients: int, positions: S
     if rest or not each:
         raise ValueError(
             f"{path} in the state has {len(value)} entries for {n_clients} clients: an algorithm's state has one entry per "
-            "client, or is named in its shared_state"
+            "client, or is declared as Held(..., shared=True)"
         )
     return [position * each + copy for position in positions for copy in range(each)]
