@@ -1,7 +1,7 @@
-"""Simulated time: how long a client's round takes, who drops out, and how the server deals with it. Needs only NumPy.
+"""Simulated time: the duration of clients' rounds, dropouts, and the server's policy. Needs only NumPy.
 
 In lockstep a client trains at the start of its round, in no time; its upload counts when the simulated time of the round is
-over. Until then it is busy: it keeps all of its state, and its upload with it.
+over. Until then it is busy: it keeps its whole state, and the upload.
 """
 
 from __future__ import annotations
@@ -21,27 +21,28 @@ from sb3_fedguide.server.rounds import participants
 WaitingPolicy = Literal["sync", "deadline", "async"]
 POLICIES: tuple[WaitingPolicy, ...] = get_args(WaitingPolicy)
 
-#: What each policy has of its own, and in how many medians it is by default.
+#: The setting that each policy has in addition, and its default in medians.
 _OWN = {"deadline": ("deadline", 2.0), "async": ("tick", 1.0)}
 _DROPOUT_MEDIANS = 2.0
 
 
 @dataclass(frozen=True)
 class DelaySettings:
-    """How long clients take, and what the server waits for. Seconds are simulated.
+    """The duration of clients' rounds, and what the server waits for. Seconds are simulated.
 
     A round of client ``i`` takes ``median * exp(spread * z_i + jitter * z)`` seconds, with one standard normal ``z_i`` for
     each client and a ``z`` for each of its rounds.
 
-    :param policy: ``"sync"`` waits until every upload has come or is known not to come. ``"deadline"`` waits no longer than
-        ``deadline``; what comes later is lost, and its client begins no other round before it has finished this one.
-        ``"async"`` aggregates after every ``tick`` what has come by then; a client then begins again at once, from what
-        the server has just sent, and the others go on.
+    :param policy: ``"sync"`` waits until every upload has arrived or is known to be lost. ``"deadline"`` waits at most
+        ``deadline``; a later upload is lost, and its client begins no other round before it has finished this one.
+        ``"async"`` aggregates after every ``tick`` the uploads that have arrived; their clients begin again at once, from
+        the new broadcast, and the others continue.
     :param median: seconds of a round of the median client
     :param spread: standard deviation of the logarithm of the clients' speeds
-    :param jitter: that of one client's rounds
+    :param jitter: standard deviation of the logarithm of one client's round times
     :param dropout: probability that a round's upload is lost
-    :param timeout: seconds after which the server knows that, and the client begins anew; twice the median by default
+    :param timeout: seconds after which the server knows of a lost upload, and the client begins a new round; twice the median
+        by default
     :param deadline: twice the median by default; may be infinite. Only with ``"deadline"``
     :param tick: the median by default. Only with ``"async"``
     :raises ValueError: for values out of range, or of another policy
@@ -90,13 +91,13 @@ class DelaySettings:
             object.__setattr__(self, name, medians * self.median)
 
     def __str__(self) -> str:
-        """What :func:`parse_delays` reads as the same settings."""
+        """The text from which :func:`parse_delays` reads the same settings."""
         values = {name: value for name, value in asdict(self).items() if name != "policy" and value is not None}
         return f"{self.policy}:" + ",".join(f"{name}={float(value)!r}" for name, value in values.items())
 
 
 def delay_settings(values: Mapping[str, Any]) -> DelaySettings:
-    """Settings by name, such as a configuration file has.
+    """Settings by name, as in a configuration file.
 
     :raises ValueError: for an unknown or missing name, or a wrong value
     """
@@ -112,7 +113,7 @@ def delay_settings(values: Mapping[str, Any]) -> DelaySettings:
 def parse_delays(text: str) -> DelaySettings:
     """Settings as one word: ``sync``, or ``async:median=60,spread=0.8,dropout=0.1,tick=30``.
 
-    :raises ValueError: for what is none
+    :raises ValueError: for a text that gives no settings
     """
     policy, _, rest = text.partition(":")
     values: dict[str, Any] = {"policy": policy}
@@ -128,10 +129,10 @@ def parse_delays(text: str) -> DelaySettings:
 
 
 class Delays:
-    """The clock of a simulated federation, and who is busy until when.
+    """The clock of a simulated federation, and until when each client is busy.
 
-    A round is :meth:`begin` and then :meth:`end`. The seconds of a client's k-th round depend on the seed, the client and k
-    alone: they are the same under every policy, and whoever else there is.
+    A round is :meth:`begin` and then :meth:`end`. The seconds of a client's k-th round depend only on the seed, the client
+    and k: they are the same under every policy, and with any other clients.
 
     :param seed: of the federation
     :param clients: ids, in the order of all masks
@@ -166,7 +167,7 @@ class Delays:
 
     @property
     def idle(self) -> np.ndarray:
-        """Who could begin a round now, ``(n_clients,)`` bool; never nobody."""
+        """The clients that could begin a round now, ``(n_clients,)`` bool; always at least one."""
         return self.idle_at <= self.seconds
 
     def draw(self, index: int) -> tuple[float, bool]:
@@ -178,11 +179,11 @@ class Delays:
         return settings.median * math.exp(deviation), bool(rng.random() < settings.dropout)
 
     def begin(self, round: int, client_fraction: float = 1.0, extra: np.ndarray | None = None) -> np.ndarray:
-        """Let a share of those begin that are idle.
+        """Let a share of the idle clients begin a round.
 
-        :param round: complete rounds, for the draw of who takes part
-        :param extra: work of each client beside its round's, as a share of it, ``(n_clients,)``; none by default
-        :return: who begins, ``(n_clients,)`` bool
+        :param round: complete rounds, for the draw of the participants
+        :param extra: each client's additional work, as a share of its round's, ``(n_clients,)``; none by default
+        :return: the clients that begin, ``(n_clients,)`` bool
         """
         present = np.zeros(len(self.clients), dtype=bool)
         present[participants(np.flatnonzero(self.idle).tolist(), self.seed, round, client_fraction)] = True
@@ -199,7 +200,7 @@ class Delays:
     def end(self) -> np.ndarray:
         """Let the time of the server's round pass.
 
-        :return: whose uploads have arrived and are to be aggregated, ``(n_clients,)`` bool
+        :return: the clients whose uploads have arrived and are aggregated, ``(n_clients,)`` bool
         """
         if self.settings.policy == "async":
             self._tick()
@@ -229,12 +230,12 @@ class Delays:
             self.seconds += tick
 
     def save_state(self) -> State:
-        """Plain data for a checkpoint; uploads that are on their way are part of their clients' own state."""
+        """Plain data for a checkpoint; uploads that have not arrived are part of their clients' own state."""
         own = {name: value for name, value in vars(self).items() if name not in ("settings", "clients")}
         return {"settings": str(self.settings), **freeze(own)}
 
     def load_state(self, state: State) -> None:
-        """Go on from what :meth:`save_state` returned.
+        """Restore what :meth:`save_state` returned.
 
         :raises ValueError: for the state of a run with other delays
         """
