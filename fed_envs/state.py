@@ -60,7 +60,7 @@ def gives_state(env: gymnasium.Env) -> bool:
 
 
 def _has_methods(env: gymnasium.Env) -> bool:
-    # With only one of the two methods, save_state reports the other as missing. ``gives_state`` speaks for an inner environment.
+    # With only one of the two methods, save_state reports the other as missing. ``gives_state``: that of an inner environment.
     return getattr(env, "gives_state", True) and (hasattr(env, "save_state") or hasattr(env, "load_state"))
 
 

@@ -64,7 +64,7 @@ def _entropy(shares: np.ndarray, axis: int) -> np.ndarray:
 def read_plans(path: Path) -> Plans:
     """What a :class:`PlanCallback` wrote. Where a round is there twice, what came later counts.
 
-    :raises ValueError: where there is no plan, or the file is damaged
+    :raises ValueError: if there is no plan, or the file is damaged
     """
     found: dict[tuple[int, int], list[float]] = {}
     lengths = set()

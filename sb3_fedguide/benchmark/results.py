@@ -32,20 +32,20 @@ class Result:
     :param final: client-average return of the deployed policies after the last round; where clients tested what they were
         sent, in the last evaluation within as many environment steps as the rounds have without tests
     :param worst_client: the lowest client's return there
-    :param success: share of the episodes there that succeeded; ``None`` where the environments do not say
-    :param broadcast: client-average return of the policy that the server sent last; ``None`` where it sends none
+    :param success: share of the episodes there that succeeded; ``None`` if the environments do not say
+    :param broadcast: client-average return of the policy that the server sent last; ``None`` if it sends none
     :param curve: evaluated round to client-average return of the deployed policies
     :param spent: evaluated round to the environment steps until then, in rounds without tests
-    :param bytes_up: uploaded per round by all clients together; ``None`` where an older file does not tell it from what was
+    :param bytes_up: uploaded per round by all clients together; ``None`` if an older file does not tell it from what was
         sent before the first round. ``bytes_down`` likewise, sent to all clients together
     :param offline_bytes_up: once, before the first round; ``offline_bytes_down`` likewise
     :param median_seconds: of the median round
-    :param config: hyperparameters; ``None`` where the file does not say
+    :param config: hyperparameters; ``None`` if the file does not say
     :param clients: their numbers; empty where the file does not say
     :param client_finals: each client's return in the evaluation that ``final`` is of; empty where the file does not say
     :param client_curve: evaluated round to each client's return; empty in files of earlier versions
-    :param steps_per_round: environment steps of all clients in a round without tests; ``None`` where the file does not say
-    :param round_seconds: of all rounds together: rollout, training and exchange; ``None`` where the file does not say
+    :param steps_per_round: environment steps of all clients in a round without tests; ``None`` if the file does not say
+    :param round_seconds: of all rounds together: rollout, training and exchange; ``None`` if the file does not say
     :param delays: the delays that were simulated; ``None`` without
     :param total_bytes: up and down, of all clients together, with what was sent before the first round
     """
@@ -85,14 +85,14 @@ class Measures:
 
     :param F: client-average return after the last round, mean over seeds; ``F_std`` its population deviation
     :param W: its worst seed
-    :param CV: deviation over absolute mean of the last twenty rounds, averaged over seeds; ``None`` where it is not defined
+    :param CV: deviation over absolute mean of the last twenty rounds, averaged over seeds; ``None`` if it is not defined
     :param worst_client: the lowest client's return, averaged over seeds
     :param speed_up: rounds of a run over the first evaluated round in which the curve is at the target; ``None`` without a
         target, or where it is never reached
     :param area: mean of the curve from the first to the last evaluated round, by environment steps, averaged over seeds
     :param difference: F less that of the baseline over the seeds that both have, and the 95 % bootstrap interval of the paired
         differences, where there are two such seeds; ``None`` without a baseline
-    :param stuck: clients per run whose return is below :data:`STUCK` of the best known of them; ``None`` where that is not
+    :param stuck: clients per run whose return is below :data:`STUCK` of the best known of them; ``None`` if that is not
         known, or not positive
     :param curve: asked-for round to client-average return, averaged over seeds; without those that were not evaluated
     :param seconds_per_round: the fastest seed's median: other work on the machine only adds
@@ -151,7 +151,7 @@ def parse_result(path: Path, content: Mapping[str, Any]) -> Result:
     """The content of a result file, or the ``summary.json`` of a run's folder.
 
     :raises ValueError: of a run that was not finished
-    :raises KeyError, TypeError, AttributeError: where something is missing or no number
+    :raises KeyError, TypeError, AttributeError: if something is missing or no number
     """
     if content["finished"] is not True:
         raise ValueError(f"it ended after {content['rounds_done']} of {content['n_rounds']} rounds")
@@ -228,7 +228,7 @@ _WITH_PRIOR = ("fedguide", "fedguide-p", "fedguide-a")
 
 
 def _offline_bytes(content: Mapping[str, Any]) -> tuple[float | None, float | None]:
-    """What went up and down before the first round; ``None`` where a file does not say and it was not nothing.
+    """What went up and down before the first round; ``None`` if a file does not say and it was not nothing.
 
     Files of earlier versions have one sum. Of the methods that they can be of, those with a prior trained its trunk together,
     except for the Gaussian prior of Bandit2D, which has none.
@@ -348,7 +348,7 @@ def paired_differences(results: Sequence[Result], baseline: Sequence[Result]) ->
 
 
 def best_known(results: Iterable[Result]) -> np.ndarray | None:
-    """The best return of each client in any of the runs, ``(n_clients,)``; ``None`` where a file does not say."""
+    """The best return of each client in any of the runs, ``(n_clients,)``; ``None`` if a file does not say."""
     best = [np.max([result.client_finals, *result.client_curve.values()], axis=0) for result in results]
     return np.max(best, axis=0) if all(len(returns) for returns in best) else None
 

@@ -60,7 +60,7 @@ class Poses:
     """Pictures of one episode.
 
     :param frames: ``(n_pictures, height, width, 3)`` uint8
-    :param background: the same without what moves, ``(height, width, 3)``; ``None`` where it was not drawn
+    :param background: the same without what moves, ``(height, width, 3)``; ``None`` if it was not drawn
     """
 
     frames: np.ndarray

@@ -45,7 +45,7 @@ def transport_plan(rows: np.ndarray, client_ids: Sequence[int]) -> np.ndarray:
 
 
 def heterogeneity(family: Family, client_ids: Sequence[int]) -> np.ndarray | None:
-    """How the clients differ, see :func:`~fed_envs.metadata_figures.heterogeneity`; ``None`` where no number differs."""
+    """How the clients differ, see :func:`~fed_envs.metadata_figures.heterogeneity`; ``None`` if no number differs."""
     figure = metadata_figures.heterogeneity(family, client_ids, width=WIDTH)
     return None if figure is None else _rgb(figure)
 

@@ -50,7 +50,7 @@ def source_key(family: Family, client: int, policy: BehaviorPolicy | None = None
 
 
 def check_source(family: Family, client: int) -> None:
-    """:raises ValueError: where nothing is known that could make the client's data"""
+    """:raises ValueError: if nothing is known that could make the client's data"""
     if family.world == "gymnasium":
         raise ValueError(
             f"{family.client(client).id} brings no offline data: give a Minari dataset with --dataset ID_OR_PATH, in Python "  # type: ignore[attr-defined]

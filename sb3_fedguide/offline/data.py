@@ -23,7 +23,7 @@ class OfflineData:
     :param rewards: in the environment's own scale, float32, ``(n,)``
     :param next_observations: float32, ``(n, obs_dim)``; the final observation where an episode ends
     :param terminations: bool, ``(n,)``; a time limit is not a termination
-    :param truncations: bool, ``(n,)``, where a time limit or the end of the record cut an episode; ``None`` where the
+    :param truncations: bool, ``(n,)``, where a time limit or the end of the record cut an episode; ``None`` if the
         observations tell: a row that does not lead to the next one is its episode's last
     :raises ValueError: for arrays that do not fit together, are empty or not finite
     """

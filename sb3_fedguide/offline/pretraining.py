@@ -102,7 +102,7 @@ class Pretraining:
         self._given_trunk = trunk
 
     def check_data(self) -> None:
-        """:raises ValueError: where no offline data can be had, before anything is computed"""
+        """:raises ValueError: if no offline data can be had, before anything is computed"""
         if self.config.dataset is not None:
             return
         if self.family is None:
@@ -206,7 +206,7 @@ class Pretraining:
         return untrained_prior(self.family, self.config, observations, actions, self.seed)
 
     def trunk_settings(self) -> dict[str, Any] | None:
-        """What clients that train a trunk together have to agree on; ``None`` where the prior has none."""
+        """What clients that train a trunk together have to agree on; ``None`` if the prior has none."""
         return self.config.settings("prior") if isinstance(self.untrained_prior(), DiffusionPrior) else None
 
     def trunk_updates(self) -> list[int]:

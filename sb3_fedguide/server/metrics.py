@@ -24,7 +24,7 @@ class ClientEvaluation:
     """One client's episodes with one policy.
 
     :param policy: ``"deployed"``, after local training, or ``"broadcast"``, what the server sent after it
-    :param successes: whether each episode succeeded; ``None`` where the environment does not say
+    :param successes: whether each episode succeeded; ``None`` if the environment does not say
     """
 
     client: int
@@ -57,7 +57,7 @@ def evaluation_row(
 
     :param timesteps: environment steps of all clients together
     :param returns: of the client's episodes, ``(n_episodes,)``, like ``lengths``
-    :param success_rate: ``None`` where the environment does not say
+    :param success_rate: ``None`` if the environment does not say
     """
     rate = "" if success_rate is None else f"{success_rate:.6g}"
     mean, std, length = np.mean(returns), np.std(returns), np.mean(lengths)

@@ -59,7 +59,7 @@ def sinkhorn_plan(
     :param row_marginal: mu, uniform by default; ``column_marginal``, nu, alike
     :param start: potentials of a similar problem, from which few iterations are left
     :raises ValueError: for costs that are not finite
-    :raises RuntimeError: where the marginal error stays above ``1e-4 / n_clients``
+    :raises RuntimeError: if the marginal error stays above ``1e-4 / n_clients``
     """
     import ot
 
@@ -100,8 +100,8 @@ def _newton_step(
     """Potentials after a Newton step on the dual of the columns, with exact rows; unchanged if the step does not help.
 
     With the row potentials eliminated, the dual is concave in the M column potentials. Its gradient is the columns' marginal
-    error, its Hessian is ``-(diag(q) - P^T diag(1 / mu) P)`` with ``q = P^T 1``. The damping vanishes with the error, so that the
-    step converges quadratically, and it keeps a step finite where the plan is a permutation and the Hessian vanishes.
+    error, its Hessian is ``-(diag(q) - P^T diag(1 / mu) P)`` with ``q = P^T 1``. The damping vanishes with the error, so that
+    the step converges quadratically, and it keeps a step finite where the plan is a permutation and the Hessian vanishes.
 
     :param scaled_cost: the costs over eta
     :param mass: the plan of ``potentials``, whose rows sum to ``mu``

@@ -71,7 +71,7 @@ def files(name: str) -> list[str]:
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write a figure as PNG and PDF; the same figure gives the same bytes.
 
-    :raises OSError: where a file cannot be written
+    :raises OSError: if a file cannot be written
     """
     paths = [folder / file for file in files(name)]
     for path, suffix in zip(paths, FORMATS, strict=True):

@@ -28,7 +28,7 @@ def draw_plans(plans: Plans, title: str, method: str = "fedguide") -> Figure:
 
     :param title: which run it is
     :param method: name of its algorithm
-    :raises ValueError: where there is only the plan before the first round
+    :raises ValueError: if there is only the plan before the first round
     """
     after = np.flatnonzero(plans.rounds > 0)
     if not len(after):

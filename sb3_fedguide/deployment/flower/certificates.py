@@ -74,7 +74,7 @@ def write_key(folder: Path, name: str) -> tuple[Path, Path]:
     """Write a client's key pair, ``name`` and ``name.pub``, in OpenSSH's format on the curve P-384, as Flower wants them.
 
     :return: private and public file
-    :raises ValueError: where there is one already, or the files cannot be written
+    :raises ValueError: if there is one already, or the files cannot be written
     """
     private, public = folder / name, folder / f"{name}.pub"
     if private.exists() or public.exists():

@@ -103,7 +103,7 @@ class ProxyServer:
     :param address: ``(host, port)`` to listen on
     :param certificate: file of the server's certificate, and ``key`` of its key
     :param n_clients: for whom connections are kept
-    :raises OSError: where the address cannot be listened on
+    :raises OSError: if the address cannot be listened on
     """
 
     def __init__(self, address: tuple[str, int], proxy: FleetProxy, certificate: Path, key: Path, n_clients: int) -> None:

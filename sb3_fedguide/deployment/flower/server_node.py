@@ -74,7 +74,7 @@ class ServerNode:
         """Run the federation to its end.
 
         :return: exit code: 0, that of the round loop, or 1 where another part of it failed
-        :raises OSError: where it could not be started
+        :raises OSError: if it could not be started
         """
         (self._folder / FINISHED).unlink(missing_ok=True)
         certificate, key = self._certificates / SERVER, self._certificates / SERVER_KEY
@@ -98,7 +98,7 @@ class ServerNode:
             return self._outcome(app.exit_code)
 
     def _outcome(self, code: int | None) -> int:
-        """The exit code for that of the round loop's process, ``None`` where another process ended first."""
+        """The exit code for that of the round loop's process, ``None`` if another process ended first."""
         if code == 0 and not (self._folder / FINISHED).is_file():
             print(
                 "Flower ended the run before its first round or in the middle of it; start the server again", file=sys.stderr
