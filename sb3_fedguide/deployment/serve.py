@@ -248,7 +248,7 @@ class Server:
             logger.warning("clients %s have not heard that the run is over; start the server again for them", sorted(away))
 
     def _report(self, round: int, replies: Mapping[int, Message], figures: dict[str, float] | None) -> None:
-        """Store the clients' evaluations, call the hook with ``figures`` unless they are ``None``, and write the checkpoint."""
+        """Store the clients' evaluations, call the hook unless ``figures`` is ``None``, and write the checkpoint."""
         evaluations = [
             evaluation
             for client, reply in sorted(replies.items())

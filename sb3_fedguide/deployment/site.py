@@ -89,7 +89,7 @@ class Site:
         self._evaluation = None if eval_freq is None or not report else _SiteEvaluation(n_rounds, eval_freq, n_episodes)
         self._learning: tuple[BaseCallback, list[RoundCallback]] | None = None
         self._trunk: TrunkTraining | None = None
-        #: the result of :meth:`Pretraining.trunk_training`
+        #: the arguments of :meth:`Pretraining.trunk_training`
         self._trunk_arguments: dict[str, Any] = {}
         #: the run of the server that this client takes part in
         self.run: str | None = None

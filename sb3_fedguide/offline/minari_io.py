@@ -18,7 +18,7 @@ from minari.serialization import deserialize_space
 
 from sb3_fedguide.offline.data import OfflineData
 
-#: How far an action may lie outside its bounds, relative to them: what a conversion between float types leaves.
+#: How far an action may lie outside its bounds, relative to them: the rounding of a conversion between float types.
 ROUNDING = 1e-5
 
 __all__ = ["check_spaces", "find_dataset", "local_root", "read_minari", "write_minari"]
@@ -141,11 +141,11 @@ def _local_datasets(root: Path) -> Iterator[str]:
 
 
 def _open(data_path: Path) -> MinariStorage:
-    """A dataset that says its spaces itself.
+    """A dataset whose metadata contain its spaces.
 
-    Where it does not, Minari would make the environment that its metadata name, and these can name any function to call.
+    Without them Minari would make the environment in the metadata, which can name any function to call.
 
-    :raises ValueError: for metadata that are none, or that do not hold both spaces
+    :raises ValueError: for invalid metadata, or metadata without both spaces
     """
     try:
         metadata = MinariStorage.read_raw_metadata(data_path)

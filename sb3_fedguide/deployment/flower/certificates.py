@@ -24,9 +24,9 @@ _AUTHORITY_DAYS = 3650
 
 
 def write_certificates(folder: Path, hosts: Sequence[str], days: int = 825) -> None:
-    """Write ``server.crt`` and ``server.key``, signed by the authority in ``folder``, which is made where there is none.
+    """Write ``server.crt`` and ``server.key``, signed by the authority in ``folder``; a missing authority is created.
 
-    Of the four files, clients get ``ca.crt`` and nothing else. ``ca.key`` is needed again for the next server certificate.
+    Of the four files, clients get only ``ca.crt``. ``ca.key`` is needed again for the next server certificate.
 
     :param hosts: names and addresses under which clients reach the server
     :param days: how long the server's certificate holds
