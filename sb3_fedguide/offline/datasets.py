@@ -1,4 +1,4 @@
-"""The clients' offline datasets: Minari datasets made on the spot and cached, or any other ones with matching spaces."""
+"""The clients' offline datasets: generated and cached Minari datasets, or any others with matching spaces."""
 
 from __future__ import annotations
 

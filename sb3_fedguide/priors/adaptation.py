@@ -1,4 +1,4 @@
-"""Refit of a client's prior head on its offline data and on what it has recently done well."""
+"""Refit of a client's prior head on its offline data and on recent actions with a high advantage."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sb3_fedguide.priors.base import HeadStatistics, Prior
 ROWS, DRAWS = 1024, 8
 #: Bound on the weights exp(A / temperature), relative to their mean over the rollout.
 MAX_WEIGHT = 20.0
-#: How much of the earlier rollouts' statistics is kept from round to round.
+#: Decay of the earlier rollouts' statistics from round to round.
 MEMORY = 0.8
 
 
@@ -39,7 +39,7 @@ class HeadAdaptation:
         return {"offline": offline, "recent": [part and freeze(vars(part)) for part in self.recent]}
 
     def load_state(self, state: State) -> None:
-        """Go on from what :meth:`save_state` returned."""
+        """Restore what :meth:`save_state` returned."""
         self.offline = [HeadStatistics(**thaw(part)) for part in state["offline"]]
         self.recent = [part and HeadStatistics(**thaw(part)) for part in state["recent"]]
 

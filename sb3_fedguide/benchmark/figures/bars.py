@@ -61,7 +61,7 @@ def draw_bars(comparison: Comparison) -> Figure:
 
 
 def draw_speed_up(comparison: Comparison, baseline: str = "local") -> Figure:
-    """With how many times fewer environment steps than a run a method reaches the baseline's F, one panel per family.
+    """Speed-up: environment steps of a run over those until a method reaches the baseline's F, one panel per family.
 
     Families without the baseline, or without another method, are left out.
 

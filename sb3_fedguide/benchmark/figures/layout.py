@@ -1,4 +1,4 @@
-"""What figures of a comparison share: panels, scales, legends beside the data, and files."""
+"""Common parts of a comparison's figures: panels, scales, legends beside the data, and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What figures of a comparison are drawn from: runs with their evaluations, by family and by method."""
+"""The data of a comparison's figures: runs with their evaluations, by family and by method."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def seconds_at(rounds: np.ndarray, result: Result) -> np.ndarray | None:
 def bytes_at(rounds: np.ndarray, result: Result) -> np.ndarray:
     """Bytes of all clients until the end of each round.
 
-    Where a file of an earlier version does not tell what was sent before the first round, that is spread like the rest.
+    If a file of an earlier version does not separate the bytes before the first round, they are spread like the rest.
     """
     before = (result.offline_bytes_up or 0.0) + (result.offline_bytes_down or 0.0)
     return before + (result.total_bytes - before) * rounds / result.n_rounds

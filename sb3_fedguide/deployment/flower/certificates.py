@@ -30,7 +30,7 @@ def write_certificates(folder: Path, hosts: Sequence[str], days: int = 825) -> N
 
     :param hosts: names and addresses under which clients reach the server
     :param days: how long the server's certificate holds
-    :raises ValueError: for a name that is none, where the files cannot be written, or where the authority ends earlier
+    :raises ValueError: for an invalid name, where the files cannot be written, or if the authority expires earlier
     """
     names = [_general_name(host) for host in dict.fromkeys([*hosts, "localhost", LOOPBACK])]
     try:

@@ -28,9 +28,9 @@ from sb3_fedguide.deployment.site import PARAMETERS, SITE
 _POLL_SECONDS = 0.2
 #: The SuperLink refuses a key for up to a minute after its SuperNode was killed.
 _RESTART_SECONDS = 10.0
-#: In which a process that has answered ends.
+#: Seconds in which a process ends after its answer.
 _EXIT_SECONDS = 5.0
-#: In which the SuperNode delivers the last reply.
+#: Seconds in which the SuperNode delivers the last reply.
 _LAST_SECONDS = 5.0
 
 
