@@ -95,6 +95,6 @@ def check_cells(rows: tuple[str, ...], goals: Sequence[Cell], named_starts: Sequ
         near = distances(rows, goal)
         lost = [cell for cell in starts if cell not in near]
         if lost:
-            raise ValueError(f"start_cells: no way leads from {lost[0]} to the goal {goal}; leave such cells out")
+            raise ValueError(f"start_cells: no path leads from {lost[0]} to the goal {goal}; leave such cells out")
         if not set(starts) - {goal}:
             raise ValueError(f"start_cells: episodes with the goal {goal} need a start elsewhere; add a start cell")

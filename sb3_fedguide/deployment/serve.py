@@ -133,7 +133,7 @@ class Server:
 
     def _refuse(self, reasons: Mapping[int, str]) -> None:
         for client, reason in reasons.items():
-            logger.warning("client %d is refused: %s; put it right there, and let it come again", client, reason)
+            logger.warning("client %d is refused: %s; correct its configuration and restart it", client, reason)
 
     def _pretrain_trunk(self) -> None:
         settings = self.clients.common["trunk"] if self.clients.common is not None else None
@@ -245,7 +245,7 @@ class Server:
                 break
             time.sleep(self.config.poll if away.difference(self.dismissed) else 0.0)
         if away := self.clients.prepared.difference(self.dismissed):
-            logger.warning("clients %s have not heard that the run is over; start the server again for them", sorted(away))
+            logger.warning("clients %s do not know that the run is over; start the server again for them", sorted(away))
 
     def _report(self, round: int, replies: Mapping[int, Message], figures: dict[str, float] | None) -> None:
         """Store the clients' evaluations, call the hook unless ``figures`` is ``None``, and write the checkpoint."""

@@ -123,7 +123,7 @@ class Site:
         :raises RuntimeError: after an exception
         """
         if not self._is_usable:
-            raise RuntimeError("an error has left this client in the middle of a message; a new Site goes on from the disk")
+            raise RuntimeError("an error interrupted this client's last message; make a new Site, which resumes from disk")
         if self.run not in (None, message.facts[RUN]):
             raise ValueError(
                 f"{self.folder} holds the state of another run of the server; give this client a new folder for a new run"

@@ -154,7 +154,7 @@ def _checked_actions(actions: np.ndarray, space: gym.Space) -> gym.spaces.Box:
         row = int(np.argwhere(outside.any(axis=1))[0, 0])
         raise ValueError(
             f"{int(outside.any(axis=1).sum())} actions lie outside the client's action space {space}, the first in row {row}: "
-            f"{actions[row]}; record what was executed"
+            f"{actions[row]}; record the executed actions"
         )
     return space
 

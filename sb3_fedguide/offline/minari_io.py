@@ -103,8 +103,8 @@ def _check_actions(data_path: Path, actions: np.ndarray, space: gym.Space) -> No
     if wrong.any():
         raise ValueError(
             f"the dataset at {data_path} has actions outside its own action space {space} in {wrong.sum()} of {len(actions)} "
-            f"rows, by up to {beyond.max():.3g}: clients would imitate what no environment executes. Record the actions that "
-            "were executed (clipped to the space), or leave these episodes out"
+            f"rows, by up to {beyond.max():.3g}: clients would imitate actions that no environment executes. Record the "
+            "executed actions (clipped to the space), or leave these episodes out"
         )
 
 

@@ -22,7 +22,8 @@ class DiffusionPrior(Prior):
     ``eps_hat = sigma a_k + alpha W [phi; 1]``: the head predicts the velocity ``(eps - sigma a_k) / alpha``. The score
     ``-eps_hat / sigma`` is affine in ``W`` with the same constant part for all clients. So averaging heads with weights that
     sum to one equals averaging scores, and two scores differ by ``-alpha / sigma (W - W') [phi; 1]``.
-    For ``W = 0`` the prior is the standard normal, towards which the ridge shrinks; and at ``t = 1`` the flow ends in the standard normal whatever ``W``.
+    For ``W = 0`` the prior is the standard normal, towards which the ridge shrinks; at ``t = 1`` the flow ends in the
+    standard normal for any ``W``.
 
     :param obs_dim: length of an observation
     :param action_dim: length of an action; actions are expected on the scale of [-1, 1]

@@ -114,7 +114,7 @@ def check_aggregator(aggregator: str, trim_fraction: float) -> None:
     if aggregator not in AGGREGATORS:
         raise ValueError(f"aggregator={aggregator!r} must be one of {', '.join(AGGREGATORS)}")
     if not 0 <= trim_fraction < 0.5:
-        raise ValueError(f"trim_fraction={trim_fraction} must lie in [0, 0.5): so much is left out on either side")
+        raise ValueError(f"trim_fraction={trim_fraction} must lie in [0, 0.5): it is the share left out on either side")
 
 
 def check_server_step(server_step: float | str, server_momentum: float) -> None:
@@ -124,7 +124,9 @@ def check_server_step(server_step: float | str, server_momentum: float) -> None:
             f"server_step={server_step!r} must be a positive number, or 'exp' for FedExP's; 1 is the average itself"
         )
     if not 0 <= server_momentum < 1:
-        raise ValueError(f"server_momentum={server_momentum} must lie in [0, 1): it is what is kept of the last update")
+        raise ValueError(
+            f"server_momentum={server_momentum} must lie in [0, 1): it is the share of the last update that is added"
+        )
 
 
 class Averaging(Strategy):

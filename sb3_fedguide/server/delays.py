@@ -59,7 +59,7 @@ class DelaySettings:
 
     def __post_init__(self) -> None:
         if self.policy not in POLICIES:
-            raise ValueError(f"what the server waits for is {' or '.join(POLICIES)}, not {self.policy!r}")
+            raise ValueError(f"policy must be {' or '.join(POLICIES)}, not {self.policy!r}")
         for name, value in list(asdict(self).items())[1:]:
             if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value)):
                 raise ValueError(f"{name}={value!r} is not a number")
@@ -67,12 +67,14 @@ class DelaySettings:
             raise ValueError(f"median={self.median} must lie in (0, 1e9]: it is the seconds of a client's round")
         for name in ("spread", "jitter"):
             if not 0 <= getattr(self, name) <= 5:
-                raise ValueError(f"{name}={getattr(self, name)} must lie in [0, 5]: it is the deviation of a logarithm")
+                raise ValueError(
+                    f"{name}={getattr(self, name)} must lie in [0, 5]: it is the standard deviation of a logarithm"
+                )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout={self.dropout} must lie in [0, 1): it is the share of uploads that are lost")
         self._default("timeout", _DROPOUT_MEDIANS)
         if not 0 < self.timeout < math.inf:  # type: ignore[operator]
-            raise ValueError(f"timeout={self.timeout} must be positive and finite: nobody waits for ever for who dropped out")
+            raise ValueError(f"timeout={self.timeout} must be positive and finite: it ends the wait for a lost upload")
         for policy, (name, medians) in _OWN.items():
             if policy == self.policy:
                 self._default(name, medians)
@@ -106,7 +108,7 @@ def delay_settings(values: Mapping[str, Any]) -> DelaySettings:
         if name not in known:
             raise ValueError(f"delays have no {name!r}; they have {', '.join(known)}")
     if "policy" not in values:
-        raise ValueError(f"what the server waits for is missing: policy is {' or '.join(POLICIES)}")
+        raise ValueError(f"policy is missing: it is {' or '.join(POLICIES)}")
     return DelaySettings(**values)
 
 
@@ -210,7 +212,7 @@ class Delays:
             self.seconds = min(self.seconds + deadline, latest)
         arrived = self.training & ~self.lost & self.idle
         if self.settings.policy != "async":
-            self.lost |= self.training & ~arrived  # nobody waits for them any more
+            self.lost |= self.training & ~arrived  # the server no longer waits for them
             self.seconds = max(self.seconds, float(self.idle_at.min()))  # until somebody can begin the next round
         self.finished = self.training & self.idle
         self.training &= ~self.finished
@@ -240,7 +242,7 @@ class Delays:
         :raises ValueError: for the state of a run with other delays
         """
         if state["settings"] != str(self.settings):
-            raise ValueError(f"the run has the delays {state['settings']}, and not {self.settings}; give it its own")
+            raise ValueError(f"the run has the delays {state['settings']}, not {self.settings}; resume it with its own")
         for name, value in state.items():
             if name != "settings":
                 setattr(self, name, thaw(value))

@@ -52,7 +52,7 @@ def write_certificates(folder: Path, hosts: Sequence[str], days: int = 825) -> N
     ends = authority.not_valid_after_utc
     if days > (left := (ends - datetime.datetime.now(datetime.UTC)).days):
         raise ValueError(
-            f"{folder / CA} holds until {ends:%Y-%m-%d} only, which a server certificate of {days} days would outlive; "
+            f"{folder / CA} expires on {ends:%Y-%m-%d}, before a server certificate of {days} days; "
             f"{f'give at most {left} days, or ' if left > 0 else ''}remove {CA} and {CA_KEY} to begin with a new authority, "
             f"and replace {CA} on every client"
         )
@@ -78,7 +78,7 @@ def write_key(folder: Path, name: str) -> tuple[Path, Path]:
     """
     private, public = folder / name, folder / f"{name}.pub"
     if private.exists() or public.exists():
-        raise ValueError(f"{private} is there already; a key that is lost cannot be made again, so remove it yourself")
+        raise ValueError(f"{private} exists already; a lost key cannot be made again, so remove it yourself")
     key = ec.generate_private_key(ec.SECP384R1())
     try:
         folder.mkdir(parents=True, exist_ok=True)

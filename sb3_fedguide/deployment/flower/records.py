@@ -40,5 +40,5 @@ def from_records(records: RecordDict) -> Message | Failure:
         if not isinstance(message.round, int) or not isinstance(message.facts, dict):
             raise TypeError("round or facts")
     except Exception as error:  # foreign bytes fail in json, NumPy, Flower and here, each in its own way
-        raise ValueError(f"a message that is none: {type(error).__name__}") from None
+        raise ValueError(f"not a valid message: {type(error).__name__}") from None
     return message
