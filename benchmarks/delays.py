@@ -179,14 +179,14 @@ def tables() -> str:
     seeds = sorted({cell["seed"] for cell in done})
     sizes = sorted({cell["n_clients"] for cell in done})
     lines = [
-        "| clients | waiting | seconds a round | heard in a round | never heard | staleness |",
+        "| clients | policy | seconds per round | uploads arrived in a round | never arrived | staleness |",
         "|--:|:--|--:|--:|--:|--:|",
     ]
     for n_clients, waiting in itertools.product(sizes, WAITING):
         seconds, heard, never, stale = np.mean([replay(n_clients, waiting, seed) for seed in seeds], axis=0)
         lines.append(f"| {n_clients} | {waiting} | {seconds:.0f} | {100 * heard:.0f} % | {100 * never:.0f} % | {stale:.1f} |")
     columns = [*(f"round {round}" for round in AT_ROUNDS), *(f"minute {minute}" for minute in AT_MINUTES)]
-    lines += ["", f"| clients | method | waiting | seeds | {' | '.join(columns)} | minutes to {THRESHOLD} |"]
+    lines += ["", f"| clients | method | policy | seeds | {' | '.join(columns)} | minutes to {THRESHOLD} |"]
     lines.append("|--:|:--|:--|--:|" + "--:|" * (len(columns) + 1))
     for n_clients, algo, waiting in itertools.product(sizes, ALGOS, WAITING):
         cells = select(done, n_clients, algo, waiting)

@@ -36,7 +36,7 @@ def reward(actions: np.ndarray, client: Bandit2DClient | int = 0, off_peak_weigh
 
     :param actions: ``(..., 2)``
     :param client: a client, or its number: client ``c`` owns peak ``c mod 4``
-    :param off_peak_weight: height of the other peaks, where ``client`` is a number
+    :param off_peak_weight: height of the other peaks, if ``client`` is a number
     :return: ``(...)`` float64
     """
     if not isinstance(client, Bandit2DClient):

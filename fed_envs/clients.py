@@ -1,4 +1,4 @@
-"""What a client's entry in a metadata file has to say, world by world."""
+"""The fields of a client's entry in a metadata file, for each kind of world."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _Reach = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-REACHER_GO
 
 
 class Client(BaseModel):
-    """What every client has: an id, counted from 0 in the order of the file."""
+    """The field of every client: an id, counted from 0 in the order of the file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

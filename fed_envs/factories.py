@@ -1,4 +1,4 @@
-"""Environments of the user's own: how they are made, checked and stepped, and what of them a checkpoint can hold."""
+"""The user's own environments: how they are made, checked and stepped, and how checkpoints save them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _STEP = "(observation, reward, terminated, truncated, info)"
 
 
 class FactoryBatch(Batch[Any]):
-    """Environments of the user's own, stepped one by one; their truncations are theirs to say."""
+    """The user's own environments, stepped one by one; they report truncations themselves."""
 
     def __init__(self, envs: Sequence[gymnasium.Env]) -> None:
         super().__init__(envs)  # type: ignore[arg-type]
@@ -53,15 +53,15 @@ class FactoryBatch(Batch[Any]):
 
 
 class Positions:
-    """Where environments stand that give no state of their own: how they were last seeded, and the moves since then.
+    """The position of environments without ``save_state``: their last seed, and the number of steps since then.
 
-    :param envs: all environments; of those that give their state nothing is noted
+    :param envs: all environments; nothing is recorded for those that give their state
     """
 
     def __init__(self, envs: Sequence[gymnasium.Env]) -> None:
-        #: which environments these are, ``(num_envs,)`` bool
+        #: environments without ``save_state``, ``(num_envs,)`` bool
         self.ordinary = np.array([not gives_state(env) for env in envs], dtype=bool)
-        #: of them, those that are not where they are said to be
+        #: those of them whose position differs from the recorded one
         self.lost = np.zeros(len(envs), dtype=bool)
         self.seeds: list[int | None] = [None] * len(envs)
         #: steps since the environment was seeded
@@ -76,7 +76,7 @@ class Positions:
         return {"seed": self.seeds[row], "moves": int(self.moves[row])}
 
     def load(self, row: int, state: State, is_the_same: bool) -> None:
-        """:param is_the_same: whether observation and episode are what the state says"""
+        """:param is_the_same: whether observation and episode equal those of the state"""
         here = is_the_same and not self.lost[row] and self.save(row) == state
         self.seeds[row], self.moves[row], self.lost[row] = state["seed"], state["moves"], not here
 
@@ -84,7 +84,7 @@ class Positions:
 def make_envs(factories: Sequence[EnvFactory], client_ids: Sequence[int], n_copies: int) -> list[gymnasium.Env]:
     """Call each client's function once for each of its copies.
 
-    :raises ClientError: where a function raises, or returns something else than a new environment
+    :raises ClientError: if a function raises, or does not return a new environment
     """
     envs: list[gymnasium.Env] = []
     for client in client_ids:
@@ -122,9 +122,9 @@ def check_spaces(envs: Sequence[gymnasium.Env], client_ids: Sequence[int]) -> No
 
 
 def flattened(env: gymnasium.Env) -> gymnasium.Env:
-    """The environment itself where its observations are flat arrays, and Gymnasium's wrapper around it otherwise.
+    """The environment itself if its observations are flat arrays, else Gymnasium's flattening wrapper around it.
 
-    :raises ValueError: where there is no flat array of them
+    :raises ValueError: if its observations cannot be flattened
     """
     space = env.observation_space
     if isinstance(space, spaces.Box) and len(space.shape) == 1:
@@ -143,7 +143,7 @@ def _say_flattened(space: str, shape: str) -> None:
 
 
 def check_monitor_files(envs: Sequence[gymnasium.Env], client_ids: Sequence[int]) -> None:
-    """:raises ValueError: where two environments' ``Monitor`` write to one file"""
+    """:raises ValueError: if the ``Monitor`` of two environments write to one file"""
     n_copies = len(envs) // len(client_ids)
     owners: dict[str, int] = {}
     for row, env in enumerate(envs):
@@ -162,7 +162,7 @@ def check_monitor_files(envs: Sequence[gymnasium.Env], client_ids: Sequence[int]
 
 @contextmanager
 def monitors_without_files() -> Iterator[None]:
-    """Every ``Monitor`` that is made meanwhile writes no file: a function that is called again would overwrite the first's."""
+    """Inside this context a new ``Monitor`` writes no file: a second call of a function would overwrite the first file."""
     before = monitor.ResultsWriter
     monitor.ResultsWriter = lambda *args, **kwargs: None  # type: ignore[assignment, misc]
     try:
@@ -172,15 +172,15 @@ def monitors_without_files() -> Iterator[None]:
 
 
 def check_shape(observation: Any, shape: tuple[int, ...]) -> None:
-    """:raises ValueError: for an observation of another shape, which NumPy may stretch without a word"""
+    """:raises ValueError: for an observation of another shape, which NumPy may broadcast silently"""
     if np.shape(observation) != shape:
         raise ValueError(f"the observation has the shape {np.shape(observation)}, the observation space {shape}")
 
 
 def check_step(result: Any, shape: tuple[int, ...]) -> Any:
-    """What a step returned, as it is.
+    """The result of a step, unchanged.
 
-    :raises ContractError: where that is something else than Gymnasium's five values
+    :raises ContractError: if it is not Gymnasium's five values
     """
     if not isinstance(result, (tuple, list)) or len(result) != 5 or not isinstance(result[4], dict):
         raise ContractError(f"has to return {_STEP}, as in Gymnasium, and returned {_described(result)}")
@@ -189,10 +189,10 @@ def check_step(result: Any, shape: tuple[int, ...]) -> Any:
 
 
 def reset_env(env: gymnasium.Env, seed: int | None, options: dict[str, Any] | None, shape: tuple[int, ...]) -> Any:
-    """Reset an environment as Stable-Baselines3 does: what is not given is not passed.
+    """Reset an environment as Stable-Baselines3 does: arguments that are not given are not passed.
 
     :return: observation and info
-    :raises ContractError: where it returns something else
+    :raises ContractError: if it returns anything else
     """
     given: dict[str, Any] = {**({} if seed is None else {"seed": seed}), **({"options": options} if options else {})}
     result = env.reset(**given)
@@ -203,7 +203,7 @@ def reset_env(env: gymnasium.Env, seed: int | None, options: dict[str, Any] | No
 
 
 def own_record(info: dict[str, Any], episode: dict[str, Any]) -> dict[str, Any]:
-    """What an environment's own ``Monitor`` or ``RecordEpisodeStatistics`` says of its episode, else ``episode``."""
+    """The episode's statistics from the environment's ``Monitor`` or ``RecordEpisodeStatistics``, else ``episode``."""
     theirs = info.get("episode")
     if not isinstance(theirs, dict):
         return episode
@@ -214,7 +214,7 @@ def own_record(info: dict[str, Any], episode: dict[str, Any]) -> dict[str, Any]:
 
 
 def _scalar(value: Any) -> Any:
-    """A number by itself where an environment has it in an array."""
+    """The number in an array of one element; other values are unchanged."""
     return value.item() if isinstance(value, np.ndarray) else value
 
 

@@ -1,4 +1,4 @@
-"""What goes wrong with one client, and says with which."""
+"""Faults of one client; the message names the client."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from operator import length_hint
 
 
 class ClientError(ValueError):
-    """A fault of one client's environment or policy; the message names the client, and the round where there is one.
+    """A fault of one client's environment or policy; the message names the client, and the round if there is one.
 
-    :param clients: ids of the clients that it concerns
+    :param clients: ids of the clients with the fault
     :param reason: what happened
     :param round: the communication round, counted from 1
     """
@@ -21,7 +21,7 @@ class ClientError(ValueError):
         super().__init__(f"client{'s' if len(self.clients) > 1 else ''} {named}{where}: {reason}")
 
     def in_round(self, round: int) -> ClientError:
-        """The same with its round, unless it has one."""
+        """The same fault with its round, unless it has one."""
         return self if self.round is not None else ClientError(self.clients, self.reason, round)
 
     def __reduce__(self) -> tuple[type[ClientError], tuple[list[int], str, int | None]]:
@@ -29,7 +29,7 @@ class ClientError(ValueError):
 
 
 class ContractError(ValueError):
-    """What an environment does against Gymnasium's interface; the text goes on after the name of its method."""
+    """An environment breaks Gymnasium's interface; the text continues after the name of its method."""
 
 
 class RowError(Exception):
@@ -43,7 +43,7 @@ class RowError(Exception):
 def run_rows(work: Callable[[Iterator[int]], None], rows: Sequence[int]) -> None:
     """Run ``work`` on an iterator of ``rows``.
 
-    :raises RowError: where it raises
+    :raises RowError: if ``work`` raises
     """
     iterator = iter(rows)
     try:
@@ -56,7 +56,7 @@ def run_rows(work: Callable[[Iterator[int]], None], rows: Sequence[int]) -> None
 def watched(work: Callable[[Iterator[int]], None]) -> Callable[[Iterator[int]], None]:
     """``work`` for an iterator that several threads share.
 
-    :raises RowError: where it raises
+    :raises RowError: if ``work`` raises
     """
 
     def run(shared: Iterator[int]) -> None:

@@ -13,11 +13,11 @@ from typing import IO, Any, Literal
 
 @contextmanager
 def atomic_file(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
-    """A file beside ``path`` that takes its place when the block ends without an error, and leaves nothing otherwise.
+    """A temporary file that replaces ``path`` when the block ends without an error, and is removed otherwise.
 
-    It is on the disk before it takes the place, so that neither a full disk nor a crash leaves half a file there.
+    It is on disk before it replaces ``path``, so that neither a full disk nor a crash leaves half a file.
 
-    :raises OSError: where it cannot be written; what was at ``path`` before stays
+    :raises OSError: if it cannot be written; the old file at ``path`` stays
     """
     target = Path(path)
     descriptor, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
@@ -36,16 +36,16 @@ def atomic_file(path: str | os.PathLike[str], mode: Literal["w", "wb"] = "w") ->
 
 
 def current_umask() -> int:
-    """The permissions that new files and folders go without."""
+    """The permissions that the umask removes from new files and folders."""
     umask = os.umask(0)
     os.umask(umask)
     return umask
 
 
 class GrowingTable:
-    """A CSV to which a run adds rows, and which is as long as the run's checkpoint says when the run goes on.
+    """A CSV to which a run adds rows; a resumed run cuts it to its length in the checkpoint.
 
-    :param path: of the file; there is none before the header is written
+    :param path: of the file, which does not exist before the header is written
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -53,7 +53,7 @@ class GrowingTable:
 
     @property
     def size(self) -> int | None:
-        """Bytes that are written; ``None`` where there is no file."""
+        """Size of the file in bytes; ``None`` if there is no file."""
         return self.path.stat().st_size if self.path.exists() else None
 
     def begin(self, columns: Sequence[str]) -> None:
@@ -63,17 +63,17 @@ class GrowingTable:
                 csv.writer(file).writerow(columns)
 
     def add(self, rows: Iterable[Sequence[Any]]) -> None:
-        """Append rows; they are on the disk when this returns."""
+        """Append rows; they are on disk when this returns."""
         with self.path.open("a", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows(rows)
             file.flush()
             os.fsync(file.fileno())
 
     def cut(self, size: int | None) -> None:
-        """Forget the rows that were written after the table had ``size`` bytes: they will be written again.
+        """Remove the rows after the first ``size`` bytes: the resumed run writes them again.
 
-        :param size: ``None`` where there was no table yet
-        :raises ValueError: where rows are missing that were there
+        :param size: ``None`` if there was no table yet
+        :raises ValueError: if the table is shorter than ``size``
         """
         if size is None:
             self.path.unlink(missing_ok=True)

@@ -41,7 +41,7 @@ def gymnasium_family(
         "schema_version": 1, "family": name if name[0].isalpha() else f"Env_{name}", "world": "gymnasium",
         "backbone": BACKBONE, "max_episode_steps": 1, "clients": clients,
     }  # fmt: skip
-    parse_family(content, name)  # ids that are not registered are said first
+    parse_family(content, name)  # reports ids that are not registered first
     limits = [_limit(client, id, own) for client, (id, own) in enumerate(zip(ids, kwargs, strict=True))]
     return parse_family({**content, "max_episode_steps": max(limits)}, name)
 
@@ -57,7 +57,7 @@ def _limit(client: int, id: str, kwargs: Mapping[str, Any]) -> int:
 
 
 class GymnasiumBatch(FactoryBatch):
-    """Steps the environments inside, one by one; their truncations are theirs to say."""
+    """Steps the inner environments one by one; they report truncations themselves."""
 
     def __init__(self, envs: Sequence[GymnasiumEnv]) -> None:
         super().__init__([env.env for env in envs])
@@ -92,7 +92,7 @@ class GymnasiumEnv(ClientEnv[GymnasiumClient]):
 
     @property
     def gives_state(self) -> bool:
-        """Whether the environment inside does."""
+        """Whether the inner environment does."""
         return state.gives_state(self.env)
 
     def _reset(self) -> tuple[np.ndarray, dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Maze maps as rows of text, and what follows from a map alone: cells, coordinates and ways.
+"""Maze maps as rows of text, and what follows from a map alone: cells, coordinates and paths.
 
 ``#`` is a wall, ``.`` is free. Cells are ``(row, column)``, counted from the top left corner; they are 1 m wide, and the
 middle of the map is the origin, x to the right and y upwards (as in gymnasium-robotics).
@@ -66,7 +66,7 @@ def cell_center(rows: tuple[str, ...], cell: Cell) -> tuple[float, float]:
 
 
 def distances(rows: tuple[str, ...], goal: Cell) -> dict[Cell, int]:
-    """How many cells it is from each cell to ``goal`` along free cells; cells without a way are missing."""
+    """The number of steps from each cell to ``goal`` along free cells; cells without a path are missing."""
     steps, queue = {goal: 0}, deque([goal])
     while queue:
         i, j = queue.popleft()
@@ -78,11 +78,11 @@ def distances(rows: tuple[str, ...], goal: Cell) -> dict[Cell, int]:
 
 
 def check_cells(rows: tuple[str, ...], goals: Sequence[Cell], named_starts: Sequence[Cell], starts: Sequence[Cell]) -> None:
-    """Check that goals and starts are free cells with a way between them.
+    """Check that goals and starts are free cells with a path between them.
 
-    :param named_starts: those that the user named
+    :param named_starts: start cells in the user's file
     :param starts: all cells in which episodes start
-    :raises ValueError: for walls, repeated cells, starts without a way to every goal, and goals without a start elsewhere
+    :raises ValueError: for walls, repeated cells, starts without a path to every goal, and goals without a start elsewhere
     """
     free = free_cells(rows)
     for name, cells in (("goal_cells", goals), ("start_cells", named_starts)):
@@ -95,6 +95,6 @@ def check_cells(rows: tuple[str, ...], goals: Sequence[Cell], named_starts: Sequ
         near = distances(rows, goal)
         lost = [cell for cell in starts if cell not in near]
         if lost:
-            raise ValueError(f"start_cells: no way leads from {lost[0]} to the goal {goal}; leave such cells out")
+            raise ValueError(f"start_cells: no path leads from {lost[0]} to the goal {goal}; leave such cells out")
         if not set(starts) - {goal}:
             raise ValueError(f"start_cells: episodes with the goal {goal} need a start elsewhere; add a start cell")

@@ -1,11 +1,11 @@
-"""Who the clients of a family are: the schema of the metadata files, their validation, and loading.
+"""The clients of a family: the schema of the metadata files, their validation, and loading.
 
 A metadata file is JSON::
 
     {"schema_version": 1, "family": "HopperHard", "world": "locomotion", "backbone": "Hopper-v5",
      "max_episode_steps": 1000, "description": "...", "clients": [{"client": 0, "mass_scale": 0.9158037, ...}, ...]}
 
-What a client has to say depends on the world, see :mod:`fed_envs.clients`.
+A client's fields depend on the world, see :mod:`fed_envs.clients`.
 Anything unknown, missing, non-finite or out of range is refused with a message that names the file, the client and the field.
 On the command line: ``python -m fed_envs.metadata {generate,show,validate}``.
 """
@@ -123,7 +123,7 @@ class Family(BaseModel):
         return parse_family(content, f"{self.name} with {parameters}")
 
     def spec(self, client: int = 0, **kwargs: Any) -> EnvSpec:
-        """The Gymnasium spec of one client's environment: it pickles, serialises to JSON, and needs no file beside it."""
+        """The Gymnasium spec of one client's environment: it can be pickled or written as JSON, and needs no metadata file."""
         self.client(client)
         shipped = self.name in FAMILIES and load_family(self.name).content_hash == self.content_hash
         identity = {"family": self.name} if shipped else {"metadata": self.to_dict()}
@@ -171,7 +171,7 @@ def parse_family(content: Any, source: str) -> Family:
     """Validate the content of a metadata file.
 
     :param content: the decoded JSON
-    :param source: what to call it in error messages, usually the file's path
+    :param source: its name in error messages, usually the file's path
     :raises ValueError: with one line per problem, naming the source, the client and the field
     """
     if not isinstance(content, dict):

@@ -23,11 +23,11 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 
 def heterogeneity(family: Family, client_ids: Sequence[int] | None = None, width: float = 6.4) -> Figure | None:
-    """How the clients differ: each parameter over its deviation; ``None`` where no number differs.
+    """How the clients differ: each parameter over its standard deviation; ``None`` if no number differs.
 
-    What is the same for all clients is left out, and names stand under the client.
+    Parameters that are the same for all clients are left out, and names stand under the client.
 
-    :param client_ids: those to show; all by default
+    :param client_ids: the clients to show; all by default
     :param width: in inches
     """
     ids = range(family.n_clients) if client_ids is None else client_ids

@@ -25,7 +25,7 @@ from fed_envs.world import Batch, Runner, ScriptedPolicy, run_here
 
 OBSERVATION_DIM = 39
 FIXED_GOAL_SEED = 0
-#: What the data's scripted policies are clipped to, and the standard deviation of their noise before the tanh.
+#: Bound on the actions of the data's scripted policies, and the standard deviation of their noise before the tanh.
 SCRIPT_LIMIT, SCRIPT_NOISE = 0.9, 0.3
 # Attributes of metaworld's environment that belong to one object, not to its state.
 _OWN = ("model", "data", "mujoco_renderer", "_np_random")
@@ -220,8 +220,8 @@ class MetaWorldEnv(MujocoClientEnv[MetaWorldClient]):
     def scripted_policy(cls, family: Family, client: int) -> ScriptedPolicy:
         """metaworld's scripted policy of the client's task, with Gaussian noise of 0.3 before a tanh.
 
-        The policies push against the bounds most of the time. Clipping their noise would put atoms there, which no density
-        of the actions has, so they act within 0.9 and the noise bends with the tanh.
+        The policies' actions are at the bounds most of the time. Clipped noise would put atoms there, which no density of the
+        actions has. So their actions stay within 0.9, and the tanh squashes the noise.
         """
         own = family.client(client)
         assert isinstance(own, MetaWorldClient)
@@ -249,10 +249,10 @@ class MetaWorldEnv(MujocoClientEnv[MetaWorldClient]):
             return super().render()
 
     def save_state(self) -> dict[str, Any]:
-        """The simulator's state, where the bodies of the shared model are, and metaworld's attributes.
+        """The simulator's state, the positions of the shared model's bodies, and metaworld's attributes.
 
-        Some attributes are views into the simulator's memory, kept as the array's name and a row. Those that are no plain
-        data are the same in every environment of the task.
+        Some attributes are views into the simulator's memory, saved as the array's name and a row. Attributes that are not
+        plain data are the same in every environment of the task.
         """
         attributes, views = {}, {}
         for name, value in self.sawyer.__dict__.items():

@@ -1,4 +1,4 @@
-"""What the MuJoCo worlds share: building a client's model, stepping the simulator, rendering."""
+"""Base classes of the MuJoCo worlds: building a client's model, stepping the simulator, rendering."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gymnasium.envs.mujoco.mujoco_env import expand_model_path
 
 from fed_envs.world import Batch, ClientEnv, ClientT, EnvT, Runner, run_here
 
-#: What of MuJoCo's data determines the steps to come.
+#: The part of MuJoCo's data that determines the next steps.
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 FRAMES = ("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat", "site_xpos", "site_xmat")
 
@@ -65,7 +65,7 @@ class MujocoClientEnv(ClientEnv[ClientT]):
         self._start()
 
     def _apply_parameters(self) -> None:
-        """Change the model to the client's, where its parameters concern the model."""
+        """Apply those of the client's parameters that concern the model."""
 
     def _scale_mass_and_damping(self, mass_scale: float, damping_scale: float) -> None:
         """Scale all bodies' masses but the world's, and all joints' damping; inertias stay as they are (as in the paper)."""

@@ -1,4 +1,4 @@
-"""Values as plain data: dicts and lists of NumPy arrays and of what JSON knows. Needs nothing but NumPy."""
+"""Values as plain data: dicts and lists of NumPy arrays and JSON values. Needs only NumPy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 #: Names to arrays, JSON values, lists and states again.
 State = dict[str, Any]
 
-#: Key of a dict that stands for something else than a dict, such as a tuple or a generator.
+#: Key of a dict that represents another type, such as a tuple or a generator.
 TAG = "__type__"
 
 
@@ -58,7 +58,7 @@ def _freeze_item(key: str, item: Any) -> Any:
 def thaw(value: Any) -> Any:
     """The inverse of :func:`freeze`; its arrays and generators are copies.
 
-    :raises ValueError: for what no :func:`freeze` returned
+    :raises ValueError: for a value that :func:`freeze` cannot have returned
     """
     if isinstance(value, list):
         return [thaw(item) for item in value]
@@ -87,9 +87,9 @@ def thaw(value: Any) -> Any:
 
 
 def generator(state: State) -> np.random.Generator:
-    """A generator that goes on where the one with this ``bit_generator.state`` stood.
+    """A generator with this ``bit_generator.state``.
 
-    :raises ValueError: for a state that is none of NumPy's
+    :raises ValueError: for a state that is not one of NumPy's
     """
     name = state.get("bit_generator") if isinstance(state, dict) else None
     kinds = {kind.__name__: kind for kind in np.random.BitGenerator.__subclasses__() if kind.__module__.startswith("numpy.")}

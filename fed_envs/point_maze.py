@@ -196,7 +196,7 @@ class PointMazeEnv(MujocoClientEnv[PointMazeClient]):
 
     @classmethod
     def scripted_policy(cls, family: Family, client: int) -> ScriptedPolicy:
-        """Rolls from cell to cell along a shortest way and stays at the goal, with Gaussian noise, squashed by tanh.
+        """Moves from cell to cell along a shortest path and stays at the goal, with Gaussian noise, squashed by tanh.
 
         It tracks a velocity of 2.5 m/s towards the next cell's middle, or towards the goal in the goal's cell and slower near
         it; it knows the client's gear and damping.
@@ -230,7 +230,7 @@ class PointMazeEnv(MujocoClientEnv[PointMazeClient]):
 
 
 def _waypoints(rows: tuple[str, ...], goal: tuple[int, int]) -> np.ndarray:
-    """For each cell ``(i, j)`` the middle of the next one on a shortest way to the goal, ``(height, width, 2)``."""
+    """For each cell ``(i, j)`` the middle of the next one on a shortest path to the goal, ``(height, width, 2)``."""
     steps = distances(rows, goal)
     table = np.array([[cell_center(rows, (i, j)) for j in range(len(rows[0]))] for i in range(len(rows))])
     for (i, j), distance in steps.items():

@@ -34,15 +34,15 @@ def environment_id(family: str) -> str:
 
 
 def entry_point_of(world: str) -> str:
-    """What Gymnasium is to load for a kind of world: :func:`environment_class` says what is missing where that fails."""
+    """Gymnasium's entry point for a kind of world; if loading fails, :func:`environment_class` says what is missing."""
     return f"{__name__}:{world}"
 
 
 def environment_class(world: str) -> Any:
     """The environment class of a kind of world.
 
-    :raises ValueError: where the world needs metaworld, which is an extra, and it is not installed; or MuJoCo cannot be loaded
-        for the way of rendering that ``MUJOCO_GL`` asks for
+    :raises ValueError: if the world needs the extra metaworld, which is not installed; or if MuJoCo cannot be loaded with the
+        renderer in ``MUJOCO_GL``
     """
     module, name = ENTRY_POINTS[world].split(":")
     try:
@@ -83,13 +83,13 @@ def register_families() -> None:
 
 
 def register_world(world: str, entry_point: str, client_model: type[Client], backbones: tuple[str, ...]) -> None:
-    """Make a kind of world of one's own known, so that metadata files can name it.
+    """Register the user's own kind of world, so that metadata files can name it.
 
     :param world: the metadata's ``world``
     :param entry_point: ``"module:Class"`` of a :class:`fed_envs.world.ClientEnv`
-    :param client_model: what a client's entry has to say
-    :param backbones: what the metadata's ``backbone`` may be
-    :raises ValueError: for a name that means something else already
+    :param client_model: the fields of a client's entry
+    :param backbones: allowed values of the metadata's ``backbone``
+    :raises ValueError: for a name that is already taken
     """
     from fed_envs.clients import BACKBONES, CLIENT_MODELS
 
@@ -99,9 +99,9 @@ def register_world(world: str, entry_point: str, client_model: type[Client], bac
 
 
 def register_family(path: str | os.PathLike[str]) -> None:
-    """Register a family of one's own by its metadata file: by name everywhere, and ``fed_envs/<Family>-v0`` in Gymnasium.
+    """Register the user's own family by its metadata file: by name everywhere, and as ``fed_envs/<Family>-v0`` in Gymnasium.
 
-    :raises ValueError: for a file that does not follow the schema, or a name that means something else already
+    :raises ValueError: for a file that does not follow the schema, or a name that is already taken
     """
     import gymnasium
 

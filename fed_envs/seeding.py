@@ -1,4 +1,4 @@
-"""Independent random streams, so that nothing one client draws depends on how many other clients share its process."""
+"""Independent random streams, so that a client's draws do not depend on the other clients in its process."""
 
 from __future__ import annotations
 

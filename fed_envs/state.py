@@ -1,4 +1,4 @@
-"""The state of environments and other objects as plain data: dicts and lists of NumPy arrays and of what JSON knows.
+"""The state of environments and other objects as plain data: dicts and lists of NumPy arrays and JSON values.
 
 Nothing in such a state is an object of a class, so that it can be stored without pickle and read without running anything.
 """
@@ -17,7 +17,7 @@ __all__ = [
     "State", "attributes", "freeze", "generator", "gives_state", "load_state", "save_state", "set_attributes", "thaw",
 ]  # fmt: skip
 
-#: Attributes of Gymnasium's classes (and the file of SB3's Monitor) that say what an environment is, not where it stands.
+#: Attributes of Gymnasium's classes (and the file of SB3's Monitor) that are not state.
 IDENTITY = (
     "env", "spec", "metadata", "render_mode", "observation_space", "action_space", "_np_random", "_np_random_seed",
     "_action_space", "_observation_space", "_metadata", "_cached_spec", "_saved_kwargs", "results_writer",
@@ -25,7 +25,7 @@ IDENTITY = (
 
 
 def attributes(owner: Any, skip: Collection[str] = ()) -> dict[str, Any]:
-    """The attributes of an object by name, without spaces, environments and functions, which say what it is."""
+    """The attributes of an object by name, without spaces, environments and functions, which are not state."""
     found: dict[str, Any] = {}
     for name, value in vars(owner).items():
         if name in skip or callable(value) or isinstance(value, (gymnasium.Env, Space)):
@@ -35,7 +35,7 @@ def attributes(owner: Any, skip: Collection[str] = ()) -> dict[str, Any]:
 
 
 def set_attributes(owner: Any, values: dict[str, Any]) -> None:
-    """Put back what :func:`attributes` returned."""
+    """Restore the attributes that :func:`attributes` returned."""
     for name, value in values.items():
         own = getattr(owner, name, None)
         if _has_state(own):
@@ -45,12 +45,12 @@ def set_attributes(owner: Any, values: dict[str, Any]) -> None:
 
 
 def _has_state(value: Any) -> bool:
-    """Whether it is one of the objects that Gymnasium's wrappers keep numbers in, such as running moments."""
+    """Whether it is an object in which Gymnasium's wrappers keep numbers, such as running moments."""
     return type(value).__module__.startswith("gymnasium.wrappers")
 
 
 def gives_state(env: gymnasium.Env) -> bool:
-    """Whether an environment can be put back to where it stands: see :func:`save_state`."""
+    """Whether an environment's state can be saved and restored: see :func:`save_state`."""
     while isinstance(env, gymnasium.Wrapper):
         if not _is_known(env) and not _has_methods(env):
             return False
@@ -59,18 +59,18 @@ def gives_state(env: gymnasium.Env) -> bool:
 
 
 def _has_methods(env: gymnasium.Env) -> bool:
-    # With one of the two, the other one is missed. An environment around another one says whether that one has them.
+    # With only one of the two methods, save_state reports the other as missing. ``gives_state``: that of an inner environment.
     return getattr(env, "gives_state", True) and (hasattr(env, "save_state") or hasattr(env, "load_state"))
 
 
 def save_state(env: gymnasium.Env) -> State:
-    """Where an environment stands: its own state, its random generator's, and that of known wrappers around it.
+    """The state of an environment, of its random generator, and of known wrappers around it.
 
-    An environment of the user's own has to have the methods ``save_state()``, which returns a dict of arrays and JSON
+    The user's own environment needs the methods ``save_state()``, which returns a dict of arrays and JSON
     values, and ``load_state(state)``. So do wrappers other than Gymnasium's and Stable-Baselines3's ``Monitor``. The
-    generator ``np_random`` is taken care of.
+    state of the generator ``np_random`` is saved here.
 
-    :raises ValueError: where they are missing
+    :raises ValueError: if these methods are missing
     """
     wrappers = []
     while isinstance(env, gymnasium.Wrapper):
@@ -85,7 +85,7 @@ def save_state(env: gymnasium.Env) -> State:
 
 
 def load_state(env: gymnasium.Env, state: State) -> None:
-    """Bring a new environment of the same kind to where :func:`save_state` was called: from there on both do the same.
+    """Restore the state of :func:`save_state` in a new environment of the same kind: from then on both behave the same.
 
     :raises ValueError: for the state of another kind of environment
     """

@@ -37,7 +37,7 @@ from fed_envs.seeding import integer_seed
 from fed_envs.state import State, load_state, save_state
 from fed_envs.world import Batch, action_dtype
 
-#: To wake a thread costs as much as some five steps of a simulator, so each is given at least this many.
+#: Waking a thread costs about as much as five simulator steps, so each thread gets at least this many environments.
 MIN_ROWS_PER_THREAD = 8
 
 
@@ -45,21 +45,21 @@ class FederatedVecEnv(VecEnv):
     """The clients of a family, some copies of each, stepped together.
 
     Environments are ordered client by client: index = position in ``client_ids`` * ``n_envs_per_client`` + copy. Each has its
-    own random stream, so that a client's trajectory does not depend on who else is here. Finished environments are reset at
+    own random stream, so that a client's trajectory does not depend on the other clients. Finished environments are reset at
     once, as SB3 expects; ``infos[i]`` of a finished one has ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``
     (``r`` return, ``l`` length, ``t`` seconds since the start, as of ``Monitor``). The info of an unfinished one is empty,
-    except for ``success`` and ``is_success`` where the world knows a success: filling it would cost more than the arithmetic
-    of the step.
+    except for ``success`` and ``is_success`` if the world has them: filling it would cost more than the arithmetic of the
+    step.
 
-    It pickles and copies with the state of simulators and random streams, so that a copy goes on exactly like the original.
+    Pickles and copies contain the state of simulators and random streams, so that a copy continues exactly like the original.
 
     :param family: a family's name, the path of a metadata file, a :class:`fed_envs.Family`, or a list of functions that make
         an environment, one per client (those are stepped one by one, and their infos are passed on; observations that are
         not flat arrays are flattened)
     :param n_envs_per_client: copies of each client's environment
-    :param clients: ids of the clients that live here; all by default
-    :param num_threads: at most so many threads step the simulators, each at least eight of them; the result does not depend
-        on it. Two pay on an idle machine; on a busy one they wait for each other.
+    :param clients: ids of the clients in this object; all by default
+    :param num_threads: largest number of threads that step the simulators, each at least eight of them; the result does not
+        depend on it. Two threads are faster on an idle machine; on a busy one they wait for each other.
     :param role: which of a federation's random streams to use (training, evaluation, ...), see :meth:`seed`
     :param render_mode: ``"rgb_array"`` or ``"human"``
     :raises ValueError: for unknown families and clients, and for environments whose spaces differ
@@ -132,7 +132,7 @@ class FederatedVecEnv(VecEnv):
             return FederatedVecEnv(source, n_envs_per_client, self.client_ids, self.num_threads, role)
 
     def reordered(self, clients: Sequence[int]) -> FederatedVecEnv:
-        """The same environments, where they stand, with the clients in the order ``clients``; it replaces this one.
+        """The same environments in their current state, with the clients in the order ``clients``; it replaces this one.
 
         :raises ValueError: for other clients
         """
@@ -165,7 +165,7 @@ class FederatedVecEnv(VecEnv):
         self._active[:] = mask
 
     def seed(self, seed: int | None = None) -> Sequence[int]:
-        """Seed the next reset: copy ``c`` of client ``k`` gets the stream ``(role, k, c)`` of ``seed``, whoever else is here.
+        """Seed the next reset: copy ``c`` of client ``k`` gets the stream ``(role, k, c)`` of ``seed``.
 
         :param seed: the federation's seed; drawn at random if ``None``
         :return: the environments' seeds
@@ -194,7 +194,7 @@ class FederatedVecEnv(VecEnv):
         self._returns[row] = 0.0
 
     def _fault(self, rows: Sequence[int], call: str, error: Exception) -> ClientError:
-        """What to raise for an exception that came out of the environments ``rows``."""
+        """The error to raise for an exception of the environments ``rows``."""
         clients = sorted({row // self.n_envs_per_client for row in rows})
         what = "" if isinstance(error, ContractError) else f"raised {type(error).__name__}: "
         hint = "; as in Gymnasium, reset() takes seed and options" if "unexpected keyword argument" in str(error) else ""
@@ -216,7 +216,7 @@ class FederatedVecEnv(VecEnv):
         all_active = bool(active.all())
         rows = range(self.num_envs) if all_active else np.flatnonzero(active).tolist()
         if not np.isfinite(actions if all_active else actions[active]).all():
-            # The simulator would warn in a log file and go on without any torque.
+            # The simulator would only warn in a log file, and continue without any torque.
             row = next(row for row in rows if not np.isfinite(actions[row]).all())
             seen, client = batch.observations[row], self.client_ids[row // self.n_envs_per_client]
             if not np.isfinite(seen).all():
@@ -228,7 +228,7 @@ class FederatedVecEnv(VecEnv):
         except RowError as fault:
             assert isinstance(fault.__cause__, Exception)
             raise self._fault([fault.row], "step()", fault.__cause__) from fault.__cause__
-        except Exception as error:  # of a world that steps all its environments at once
+        except Exception as error:  # from a world that steps all its environments at once
             raise self._fault(rows, "step()", error) from error
 
         rewards, terminated = batch.rewards, batch.terminated
@@ -271,11 +271,11 @@ class FederatedVecEnv(VecEnv):
             other.result()
 
     def save_state(self) -> State:
-        """Where all environments stand, as plain data: simulators, random streams, running returns, who is active.
+        """The state of all environments, as plain data: simulators, random streams, running returns, which are active.
 
-        Of environments without ``save_state`` and ``load_state`` it holds only how they got there.
+        For environments without ``save_state`` and ``load_state`` it has only their seeds and number of steps.
 
-        :raises ClientError: for what an environment has in its state and is no plain data
+        :raises ClientError: if an environment's state is not plain data
         """
         return {
             "clients": list(self.client_ids),
@@ -298,9 +298,9 @@ class FederatedVecEnv(VecEnv):
             raise ClientError([client], f"its environment cannot be part of a checkpoint: {error}") from error
 
     def load_state(self, state: State) -> None:
-        """Bring new environments of the same clients to where :meth:`save_state` was called.
+        """Restore the state of :meth:`save_state` in new environments of the same clients.
 
-        Environments that give no state, and do not happen to stand there, begin new episodes with
+        Environments that give no state, and are not in that state already, begin new episodes with
         :meth:`begin_lost_episodes`.
 
         :raises ValueError: for the state of other environments
@@ -324,7 +324,7 @@ class FederatedVecEnv(VecEnv):
 
     @property
     def lost(self) -> np.ndarray:
-        """``(num_envs,)`` bool: the active environments that :meth:`load_state` could not bring to where they stood."""
+        """``(num_envs,)`` bool: the active environments whose state :meth:`load_state` could not restore."""
         return self._positions.lost & self._active
 
     def begin_lost_episodes(self) -> tuple[np.ndarray, np.ndarray, list[int]]:
@@ -375,7 +375,7 @@ class FederatedVecEnv(VecEnv):
         return [env.get_wrapper_attr(method_name)(*method_args, **method_kwargs) for env in self._targets(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        # What Monitor records is recorded here, so nobody needs to wrap again for it.
+        # This records what Monitor records, so no Monitor wrapper is needed.
         return [wrapper_class is Monitor or is_wrapped(env, wrapper_class) for env in self._targets(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:

@@ -1,4 +1,4 @@
-"""What all client environments share: one client's environment, and the batch that steps several of them together.
+"""Base classes of all client environments: one client's environment, and the batch that steps several of them together.
 
 A :class:`Batch` is the one definition of a world's observation, reward and termination, written with NumPy over a leading
 axis of environments. A single environment is a batch of one, :class:`fed_envs.FederatedVecEnv` is a batch of many, so that
@@ -37,7 +37,7 @@ def run_here(work: Callable[[Iterator[int]], None], rows: Sequence[int]) -> None
 
 
 def action_dtype(space: gymnasium.spaces.Space) -> type | np.dtype:
-    """In which actions arrive in :meth:`Batch.step`: float32, and whole numbers for choices."""
+    """The dtype of actions in :meth:`Batch.step`: float32, and integers for discrete actions."""
     return np.float32 if isinstance(space, gymnasium.spaces.Box) else np.dtype(space.dtype)
 
 
@@ -58,9 +58,9 @@ class Batch(ABC, Generic[EnvT]):
 
     @abstractmethod
     def step(self, actions: np.ndarray, rows: Sequence[int], run: Runner = run_here) -> None:
-        """Step the environments in ``rows`` and update the arrays there (other rows' rewards carry no meaning).
+        """Step the environments in ``rows`` and update the arrays there (other rows' rewards have no meaning).
 
-        :param actions: ``(n, *action_space.shape)`` float32, or integers for choices, one row per environment of the batch
+        :param actions: ``(n, *action_space.shape)`` float32, or integers for discrete actions, one row per environment
         :param rows: the environments to step
         :param run: how to go through the rows
         """
@@ -70,7 +70,7 @@ class Batch(ABC, Generic[EnvT]):
         """The info of the last step of one environment, as a single environment returns it."""
 
     def infos(self) -> list[dict[str, Any]]:
-        """New dictionaries to start the vectorised step's infos from, one per environment."""
+        """New dictionaries for the infos of the vectorised step, one per environment."""
         return [{} for _ in self.envs]
 
 
@@ -79,8 +79,8 @@ class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], ABC, Generic[ClientT]):
 
     :param client: the client's id
     :param family: name of a family that ships with the package (the registered ids set it)
-    :param metadata: the user's own clients: the path of a metadata file, or its content, or a :class:`fed_envs.Family` (with
-        which ``gymnasium.make`` works too, but the spec cannot be written as JSON; :meth:`fed_envs.Family.make` can)
+    :param metadata: the user's own clients: the path of a metadata file, or its content, or a :class:`fed_envs.Family` (then
+        the spec of ``gymnasium.make`` cannot be written as JSON; that of :meth:`fed_envs.Family.make` can)
     :param render_mode: one of ``metadata["render_modes"]``
     :param parameters: client fields to replace, e.g. ``floor_priority=True``
     :raises ValueError: for unknown families, clients, fields and values, and for metadata that do not fit the registered id
@@ -88,7 +88,7 @@ class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], ABC, Generic[ClientT]):
 
     world: ClassVar[str]
     batch_class: ClassVar[type[Batch[Any]]]
-    #: raised whenever the scripted policy changes, so that old data are not taken for new ones
+    #: increased whenever the scripted policy changes, so that cached data of the old policy are not reused
     script_version: ClassVar[int] = 1
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own interface)
     observation_space: gymnasium.spaces.Box
@@ -119,7 +119,7 @@ class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], ABC, Generic[ClientT]):
 
     @classmethod
     def scripted_policy(cls, family: Family, client: int) -> ScriptedPolicy | None:
-        """A behaviour to make a client's offline data with, strictly inside the action bounds, where the world knows one."""
+        """A behaviour policy for a client's offline data, strictly inside the action bounds, if the world has one."""
         return None
 
     @abstractmethod
@@ -145,15 +145,15 @@ class ClientEnv(gymnasium.Env[np.ndarray, np.ndarray], ABC, Generic[ClientT]):
         return batch.observations[0].copy(), float(batch.rewards[0]), bool(batch.terminated[0]), False, batch.info(0)
 
     def save_state(self) -> dict[str, Any]:
-        """Where the episode stands, without the random generator: arrays, JSON values, and lists and dicts of these.
+        """The state of the episode, without the random generator: arrays, JSON values, and lists and dicts of these.
 
-        Worlds whose state is more than the plain attributes of the environment override it and :meth:`load_state`; see
+        Worlds whose state is more than the plain attributes of the environment override this and :meth:`load_state`; see
         :func:`fed_envs.state.save_state` for the whole state of an environment and its wrappers.
         """
         return attributes(self, _IDENTITY)
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Go on from what :meth:`save_state` returned, on an environment of the same client."""
+        """Restore what :meth:`save_state` returned, in an environment of the same client."""
         set_attributes(self, state)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -261,7 +261,7 @@ def test_shipped_families_come_from_the_generator(name):
         ({"goal_cells": [[1.5, 1]]}, "goal_cells"),
         ({"start_cells": [[9, 9]]}, r"start_cells: not free in this maze: \(9, 9\)"),
         ({"goal_cells": [[1, 2]], "start_cells": [[1, 2]]}, "start_cells: episodes with the goal .* need a start elsewhere"),
-        ({"maze": ["#####", "#.#.#", "#####"], "goal_cells": [[1, 1]]}, r"start_cells: no way leads from \(1, 3\)"),
+        ({"maze": ["#####", "#.#.#", "#####"], "goal_cells": [[1, 1]]}, r"start_cells: no path leads from \(1, 3\)"),
         ({"gear_scale": 0.0}, "gear_scale: .*greater than 0"),
         ({"mass_scale": 1.0}, "mass_scale: is not a known field"),
     ],

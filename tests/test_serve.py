@@ -300,7 +300,7 @@ def test_a_finished_server_that_is_started_again_tells_who_was_away(tmp_path, ca
     with caplog.at_level(logging.WARNING):
         _, server, _ = run(transport=transport, folder=tmp_path)
     assert server.finished and server.dismissed == [0, 1, 3] and list(server.outbox) == [2]
-    assert "clients [2] have not heard that the run is over" in caplog.text
+    assert "clients [2] do not know that the run is over" in caplog.text
     nobody = LoopTransport(Client, [])
     run(transport=nobody, folder=tmp_path)
     assert nobody.sent == []

@@ -22,7 +22,7 @@ class Aggregate:
     """One method over all families.
 
     :param iqm: interquartile mean of the normalised scores
-    :param interval: 95 % bootstrap interval; ``None`` where no family has two runs, so that nothing can be resampled
+    :param interval: 95 % bootstrap interval; ``None`` if no family has two runs, so that nothing can be resampled
     :param scores: normalised mean score of each family
     """
 
@@ -38,7 +38,7 @@ def aggregate(method: str, finals: Mapping[str, Sequence[float]], levels: Mappin
 
     :param finals: family to F of each run
     :param levels: family to the returns that score 0 and 1
-    :raises ValueError: where the second of a family's levels is not above the first
+    :raises ValueError: if the second of a family's levels is not above the first
     """
     groups = [normalise(np.asarray(values, dtype=float), *levels[family]) for family, values in finals.items()]
     resampled = any(len(group) > 1 for group in groups)

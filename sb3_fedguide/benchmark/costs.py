@@ -1,4 +1,4 @@
-"""What a run will cost, in seconds of one core that does nothing else: estimates from measured rounds, not promises.
+"""Estimated cost of a run, in seconds of one idle core, from measured rounds.
 
 The figures are those of ``docs/performance.md`` (networks 64-64, eight clients, a quiet machine). A busy machine takes two or
 three times as long; so does another processor.
@@ -25,7 +25,7 @@ STEPS: dict[str, tuple[float, int]] = {
     "Bandit2D": (40, 1), "Reacher-v5": (25, 50), "Hopper-v5": (61, 700), "Walker2d-v5": (90, 1000),
     "HalfCheetah-v5": (32, 1000), "MetaWorld-v3": (410, 500), "PointMaze-v3": (33, 300),
 }  # fmt: skip
-#: For backbones that nobody has measured.
+#: For backbones without a measurement.
 OTHER_STEPS = (60, 1000)
 #: How much longer a step takes for each width of 64 more.
 STEP_WIDTH = 0.2
@@ -33,7 +33,7 @@ STEP_WIDTH = 0.2
 ROW, ROW_WIDTH = 4.9, 64
 #: Microseconds of a client's gradient step of DDPG, 64-64.
 DDPG_STEP = 360.0
-#: With how much more training a method's own terms come; and of a whole round, with each estimator of the prior's term.
+#: Factor of a method's own terms on training time; and on a whole round, for each estimator of the prior's term.
 TRAINING = {"fedprox": 1.3, "fedkl": 1.4, "fedsvrpgm": 1.9}
 PRIOR_ROUND = {"sample": 1.2, "snis": 1.75}
 #: Milliseconds of an update of eight clients of behaviour cloning, trunk and DICE with so many rows in a batch.
@@ -96,7 +96,7 @@ def estimate(
 
 
 def _evaluations(values: Mapping[str, Any], eval_freq: int, eval_average: bool) -> int:
-    """Of the deployed policies, of what the server sends, and of averages; a ``mix`` that ends is taken for one that stays."""
+    """Of the deployed policies, of broadcast policies, and of averages; a ``mix`` that ends counts as one that stays."""
     found, n_rounds = 0, values["n_rounds"]
     for round in range(1, n_rounds + 1):
         due = deployed_is_due(round, n_rounds, eval_freq)

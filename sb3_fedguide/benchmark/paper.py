@@ -1,4 +1,4 @@
-"""Figures of the paper that ours stand beside."""
+"""The paper's results, for comparison."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run's table of transport plans says about who listens to whom."""
+"""A run's table of transport plans: the share of every client's head in every other client's prior."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from sb3_fedguide.server.ot_moe import given_heads
 class Plans:
     """A run's plans.
 
-    :param rounds: that have one, ``(n_rounds,)``; 0 is the one before the first round
-    :param clients: numbers of all that were ever routed, ``n_clients``
+    :param rounds: with a plan, ``(n_rounds,)``; 0 is the plan before the first round
+    :param clients: numbers of all clients in any plan, ``n_clients``
     :param weights: of the experts in each client's mixture, ``(n_rounds, n_clients, n_experts)``; NaN where a client
         was absent
     """
@@ -45,7 +45,7 @@ class Plans:
     def listening(self) -> np.ndarray:
         """Share of client i's head in client j's prior at [round, j, i], ``(n_rounds, n_clients, n_clients)``.
 
-        NaN where j was absent, and in round 0: its experts are heads as they are, not averages.
+        NaN where j was absent, and in round 0, whose experts are single heads, not averages.
         """
         n = len(self.clients)
         given = np.full((len(self.rounds), n, n), np.nan)
@@ -62,9 +62,9 @@ def _entropy(shares: np.ndarray, axis: int) -> np.ndarray:
 
 
 def read_plans(path: Path) -> Plans:
-    """What a :class:`PlanCallback` wrote. Where a round is there twice, what came later counts.
+    """The table that a :class:`PlanCallback` wrote. If a round is in it twice, the later rows count.
 
-    :raises ValueError: where there is no plan, or the file is damaged
+    :raises ValueError: if there is no plan, or the file is damaged
     """
     found: dict[tuple[int, int], list[float]] = {}
     lengths = set()

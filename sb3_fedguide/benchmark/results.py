@@ -20,7 +20,7 @@ from sb3_fedguide.benchmark.paper import PAPER_F
 from sb3_fedguide.settings.evaluation import LAST_ROUNDS
 from sb3_fedguide.settings.pretraining import prior_is_gaussian
 
-#: A client is stuck whose return is below this share of the best that is known of it.
+#: A client is stuck if its return is below this share of its best known return.
 STUCK = 0.6
 
 
@@ -29,25 +29,25 @@ class Result:
     """One finished run.
 
     :param n_episodes: episodes per client in an evaluation
-    :param final: client-average return of the deployed policies after the last round; where clients tested what they were
-        sent, in the last evaluation within as many environment steps as the rounds have without tests
+    :param final: client-average return of the deployed policies after the last round; if clients tested broadcast policies,
+        in the last evaluation within the environment steps of a run without tests
     :param worst_client: the lowest client's return there
-    :param success: share of the episodes there that succeeded; ``None`` where the environments do not say
-    :param broadcast: client-average return of the policy that the server sent last; ``None`` where it sends none
+    :param success: share of the episodes there that succeeded; ``None`` if the environments do not report it
+    :param broadcast: client-average return of the last broadcast policy; ``None`` if there is none
     :param curve: evaluated round to client-average return of the deployed policies
     :param spent: evaluated round to the environment steps until then, in rounds without tests
-    :param bytes_up: uploaded per round by all clients together; ``None`` where an older file does not tell it from what was
-        sent before the first round. ``bytes_down`` likewise, sent to all clients together
+    :param bytes_up: uploaded per round by all clients together; ``None`` if an older file does not separate it from the
+        uploads before the first round. ``bytes_down`` likewise, sent to all clients together
     :param offline_bytes_up: once, before the first round; ``offline_bytes_down`` likewise
     :param median_seconds: of the median round
-    :param config: hyperparameters; ``None`` where the file does not say
+    :param config: hyperparameters; ``None`` if the file does not say
     :param clients: their numbers; empty where the file does not say
-    :param client_finals: each client's return in the evaluation that ``final`` is of; empty where the file does not say
+    :param client_finals: each client's return in the evaluation of ``final``; empty where the file does not say
     :param client_curve: evaluated round to each client's return; empty in files of earlier versions
-    :param steps_per_round: environment steps of all clients in a round without tests; ``None`` where the file does not say
-    :param round_seconds: of all rounds together: rollout, training and exchange; ``None`` where the file does not say
+    :param steps_per_round: environment steps of all clients in a round without tests; ``None`` if the file does not say
+    :param round_seconds: of all rounds together: rollout, training and exchange; ``None`` if the file does not say
     :param delays: the delays that were simulated; ``None`` without
-    :param total_bytes: up and down, of all clients together, with what was sent before the first round
+    :param total_bytes: up and down, of all clients together, with the exchanges before the first round
     """
 
     path: Path
@@ -83,16 +83,16 @@ class Result:
 class Measures:
     """One method on one family, over its seeds.
 
-    :param F: client-average return after the last round, mean over seeds; ``F_std`` its population deviation
+    :param F: client-average return after the last round, mean over seeds; ``F_std`` its population standard deviation
     :param W: its worst seed
-    :param CV: deviation over absolute mean of the last twenty rounds, averaged over seeds; ``None`` where it is not defined
+    :param CV: standard deviation over absolute mean of the last twenty rounds, averaged over seeds; ``None`` if undefined
     :param worst_client: the lowest client's return, averaged over seeds
     :param speed_up: rounds of a run over the first evaluated round in which the curve is at the target; ``None`` without a
         target, or where it is never reached
     :param area: mean of the curve from the first to the last evaluated round, by environment steps, averaged over seeds
-    :param difference: F less that of the baseline over the seeds that both have, and the 95 % bootstrap interval of the paired
-        differences, where there are two such seeds; ``None`` without a baseline
-    :param stuck: clients per run whose return is below :data:`STUCK` of the best known of them; ``None`` where that is not
+    :param difference: F minus the baseline's F over their common seeds, and the 95 % bootstrap interval of the paired
+        differences, if there are two such seeds; ``None`` without a baseline
+    :param stuck: clients per run whose return is below :data:`STUCK` of their best known return; ``None`` if that is not
         known, or not positive
     :param curve: asked-for round to client-average return, averaged over seeds; without those that were not evaluated
     :param seconds_per_round: the fastest seed's median: other work on the machine only adds
@@ -151,7 +151,7 @@ def parse_result(path: Path, content: Mapping[str, Any]) -> Result:
     """The content of a result file, or the ``summary.json`` of a run's folder.
 
     :raises ValueError: of a run that was not finished
-    :raises KeyError, TypeError, AttributeError: where something is missing or no number
+    :raises KeyError, TypeError, AttributeError: if something is missing or no number
     """
     if content["finished"] is not True:
         raise ValueError(f"it ended after {content['rounds_done']} of {content['n_rounds']} rounds")
@@ -198,7 +198,7 @@ def parse_result(path: Path, content: Mapping[str, Any]) -> Result:
 
 
 def _final_returns(content: Mapping[str, Any]) -> list[float]:
-    """Where clients tested: each one's return in the last evaluation within the steps that the rounds have without tests."""
+    """For runs with tests: each client's return in the last evaluation within the steps of a run without tests."""
     if not (tests := content.get("test_timesteps", 0)):
         return []
     budget = content["timesteps"] - tests
@@ -228,10 +228,10 @@ _WITH_PRIOR = ("fedguide", "fedguide-p", "fedguide-a")
 
 
 def _offline_bytes(content: Mapping[str, Any]) -> tuple[float | None, float | None]:
-    """What went up and down before the first round; ``None`` where a file does not say and it was not nothing.
+    """Bytes up and down before the first round; ``None`` if they are not zero and the file does not give them.
 
-    Files of earlier versions have one sum. Of the methods that they can be of, those with a prior trained its trunk together,
-    except for the Gaussian prior of Bandit2D, which has none.
+    Files of earlier versions have one sum. Their methods with a prior trained its trunk together, except the Gaussian prior
+    of Bandit2D, which has no trunk.
     """
     if "offline_bytes_up" in content:
         return float(content["offline_bytes_up"]), float(content["offline_bytes_down"])
@@ -323,9 +323,9 @@ def measure(
 
 
 def speed_up(results: Sequence[Result], target: float) -> float | None:
-    """With how many times fewer environment steps than a run has the seeds' mean curve reaches ``target``; ``None`` if never.
+    """Environment steps of a run over those at which the seeds' mean curve reaches ``target``; ``None`` if it never does.
 
-    :param results: one per seed; rounds that not all of them evaluated do not count
+    :param results: one per seed; only rounds that all seeds evaluated count
     """
     everywhere = set.intersection(*(set(result.curve) for result in results))
     for round in sorted(everywhere):
@@ -342,13 +342,13 @@ def area(result: Result) -> float:
 
 
 def paired_differences(results: Sequence[Result], baseline: Sequence[Result]) -> list[float]:
-    """F of each seed less the baseline's with the same seed."""
+    """F of each seed minus the baseline's with the same seed."""
     theirs = {result.seed: result.final for result in baseline}
     return [result.final - theirs[result.seed] for result in results if result.seed in theirs]
 
 
 def best_known(results: Iterable[Result]) -> np.ndarray | None:
-    """The best return of each client in any of the runs, ``(n_clients,)``; ``None`` where a file does not say."""
+    """The best return of each client in any of the runs, ``(n_clients,)``; ``None`` if a file does not say."""
     best = [np.max([result.client_finals, *result.client_curve.values()], axis=0) for result in results]
     return np.max(best, axis=0) if all(len(returns) for returns in best) else None
 
@@ -370,7 +370,7 @@ def _known_mean(values: Sequence[float | None]) -> float | None:
 
 
 def volatility(result: Result) -> float | None:
-    """CV of one run: deviation over absolute mean of its last twenty rounds; ``None`` for one round, and for a mean of 0."""
+    """CV of one run: standard deviation over absolute mean of the last twenty rounds; ``None`` for one round or mean 0."""
     last = [value for round, value in result.curve.items() if round > result.n_rounds - LAST_ROUNDS]
     mean = abs(float(np.mean(last))) if len(last) > 1 else 0.0
     return float(np.std(last)) / mean if mean > 0 else None

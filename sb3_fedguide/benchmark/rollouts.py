@@ -29,7 +29,7 @@ class Episode:
     """A deterministic episode.
 
     :param client: its number
-    :param observations: raw, ``(n_steps + 1, ...)``; of dictionaries, nothing
+    :param observations: raw, ``(n_steps + 1, ...)``; empty for dictionaries
     :param actions: ``(n_steps, ...)``
     :param positions: horizontal position of a walking body, ``(n_steps + 1,)``; empty in other worlds
     :param rewards: ``(n_steps,)``
@@ -60,7 +60,7 @@ class Poses:
     """Pictures of one episode.
 
     :param frames: ``(n_pictures, height, width, 3)`` uint8
-    :param background: the same without what moves, ``(height, width, 3)``; ``None`` where it was not drawn
+    :param background: the same without what moves, ``(height, width, 3)``; ``None`` if it was not drawn
     """
 
     frames: np.ndarray
@@ -131,9 +131,9 @@ def pictures(family: Family, episode: Episode, steps: Sequence[int]) -> Iterator
 
 
 def poses(family: Family, episode: Episode, steps: Sequence[int], size: tuple[int, int]) -> Poses:
-    """Pictures for one that shows many poses.
+    """Pictures to combine into one with many poses.
 
-    A walking body is seen by a camera that stays where it is, and Reacher's arm from above.
+    A fixed camera shows a walking body, and Reacher's arm from above.
 
     :param size: width and height in pixels; worlds that choose theirs keep it
     """
@@ -171,7 +171,7 @@ def _from_above(episode: Episode, size: tuple[int, int]) -> dict[str, Any]:
 
 
 def _distance(height: float) -> float:
-    """From which a camera with MuJoCo's usual angle of view sees ``height`` metres."""
+    """Distance from which a camera with MuJoCo's default angle of view sees ``height`` metres."""
     return height / (2 * np.tan(np.radians(45.0) / 2))
 
 
@@ -180,9 +180,9 @@ _CAMERAS = {"locomotion": _from_the_side, "reacher": _from_above}
 
 
 def overlay(poses: Poses, faintest: float = 0.25, threshold: int = 14) -> np.ndarray:
-    """All poses in one picture: the later, the stronger.
+    """All poses in one picture: later poses are more opaque.
 
-    Where there is no background, it is what most of the pictures have at a pixel.
+    Without a background, the median over the pictures replaces it.
 
     :param faintest: how opaque the first pose is; the last is opaque
     :param threshold: difference from the background from which a pixel belongs to a pose

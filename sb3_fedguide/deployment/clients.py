@@ -1,4 +1,4 @@
-"""Who belongs to a federation: who has joined with the same settings, who was refused and why, who is ready to train."""
+"""The members of a federation: clients that joined with the same settings, refused ones and why, those ready to train."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 Facts = dict[str, Any]
 
-#: What a run is, whatever version goes on with it.
+#: Facts that identify a run, also after a change of version.
 RUN_FACTS = ("algorithm", "seed", "n_rounds", "rollout_size", "settings")
-#: Of what client and server both state; it has to be the same.
+#: Facts that client and server both state; they have to be equal.
 SERVER_FACTS = ("version", *RUN_FACTS)
-#: Of what only clients know; it has to be what most of those say with whom the run began.
+#: Facts that only clients know; they have to be those of most of the clients with which the run began.
 CLIENT_FACTS = ("shapes", "trunk")
 
 
 def server_facts(config: ServerConfig) -> Facts:
-    """What the server says of itself in its ``join`` message."""
+    """The server's facts in its ``join`` message."""
     return {
         "algorithm": config.algorithm,
         "version": sb3_fedguide.__version__,
@@ -36,7 +36,7 @@ def server_facts(config: ServerConfig) -> Facts:
 
 
 def difference(theirs: Mapping[str, Any], ours: Mapping[str, Any], names: Iterable[str], whose: str) -> str | None:
-    """The first of ``names`` in which two statements differ, in words; ``None`` where they agree.
+    """The first of ``names`` in which two statements differ, in words; ``None`` if they agree.
 
     :param whose: to whom ``ours`` belongs, such as ``"the server's"``
     """
@@ -54,22 +54,22 @@ def difference(theirs: Mapping[str, Any], ours: Mapping[str, Any], names: Iterab
 class Clients:
     """The clients by id.
 
-    :param facts: what the server says of itself
+    :param facts: the server's
     """
 
     def __init__(self, facts: Facts) -> None:
         self.facts = facts
-        #: what each client said that has joined
+        #: the facts of each client that has joined
         self.joined: dict[int, Facts] = {}
-        #: who was refused, and why
+        #: refused clients, and why
         self.refused: dict[int, str] = {}
-        #: who has been through the offline stage
+        #: clients that have completed the offline stage
         self.prepared: set[int] = set()
-        #: what clients have to have in common, known when the run has begun
+        #: facts that all clients must share, known when the run has begun
         self.common: Facts | None = None
 
     def newcomers(self, present: Collection[int]) -> list[int]:
-        """Who has to be asked; a refused client is asked again when it has been away."""
+        """The clients to ask; a refused client is asked again when it has been away."""
         self.refused = {client: reason for client, reason in self.refused.items() if client in present}
         return sorted(set(present) - self.joined.keys() - self.refused.keys())
 
@@ -90,9 +90,9 @@ class Clients:
         return reason
 
     def agree(self, n_clients: int) -> dict[int, str]:
-        """Settle what clients have in common by what most say, if at least ``n_clients`` say so; the others are refused.
+        """Set the common facts to those of most clients, if at least ``n_clients`` state them; the others are refused.
 
-        :return: why, by client
+        :return: the reasons, by client
         """
         if self.common is not None or not self.joined:
             return {}
@@ -115,7 +115,7 @@ class Clients:
         return freeze({"joined": self.joined, "prepared": sorted(self.prepared), "common": self.common})
 
     def load_state(self, state: State) -> None:
-        """Everybody is asked to join again: server and clients may go on with another version."""
+        """Ask all clients to join again: server and clients may resume with another version."""
         saved = thaw(state)
         self.prepared, self.common = set(saved["prepared"]), saved["common"]
 

@@ -1,4 +1,4 @@
-"""What the server of a real federation has to know."""
+"""The configuration of the server of a real federation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from sb3_fedguide.server.methods import complete_settings
 from sb3_fedguide.settings.participants import n_participants
 
-#: In which a run without limits ends.
+#: Seconds for the end of a run without limits.
 _FINISH_SECONDS = 600.0
 
 
@@ -20,23 +20,23 @@ class TooFewClients(RuntimeError):
 
 @dataclass(frozen=True)
 class ServerConfig:
-    """What a server has to know.
+    """The configuration of a server.
 
     :param algorithm: command-line name
-    :param n_clients: clients of the whole federation; also the number of experts where the settings do not say it
+    :param n_clients: clients of the whole federation; also the number of experts if the settings do not give it
     :param n_rounds: rounds of the run
     :param rollout_size: environment steps of a client in a round
     :param seed: the federation's
-    :param settings: the method's hyperparameters on the server, see :mod:`sb3_fedguide.server.methods`; those that are
-        not given have the constructors' defaults
+    :param settings: the method's hyperparameters on the server, see :mod:`sb3_fedguide.server.methods`; missing
+        ones have the constructors' defaults
     :param timeout: seconds that a client may take for a round; ``None`` for no limit
     :param setup_timeout: the same of everything before the first round, where behaviour cloning, priors and DICE are trained
-    :param start_clients: clients that are awaited before anything begins; by default all
-    :param min_clients: replies without which a round does not end: those missing are asked again
+    :param start_clients: number of clients for which the server waits before anything begins; by default all
+    :param min_clients: number of replies that a round needs; missing clients are asked again
     :param wait: seconds to wait for too few clients before
-        :class:`~sb3_fedguide.deployment.serve.TooFewClients` ends the run; 0 not to wait, ``None`` for ever. At the end,
-        who is away is waited for no longer than this and ``timeout``, or ten minutes
-    :param poll: seconds between two looks at who is there
+        :class:`~sb3_fedguide.deployment.serve.TooFewClients` ends the run; 0 not to wait, ``None`` for no limit. At the
+        end, it waits for absent clients at most as long as this and ``timeout``, or ten minutes
+    :param poll: seconds between two checks of the present clients
     :raises ValueError: for values that do not fit
     """
 
@@ -78,7 +78,7 @@ class ServerConfig:
 
     @property
     def finish_timeout(self) -> float:
-        """Seconds that the end of the run waits for who is away."""
+        """Seconds for which the server waits for absent clients at the end of the run."""
         return min(_FINISH_SECONDS if self.timeout is None else self.timeout, math.inf if self.wait is None else self.wait)
 
     @property

@@ -1,6 +1,6 @@
 """The server of a real federation: its rounds over any :class:`~sb3_fedguide.deployment.transport.Transport`.
 
-It needs neither PyTorch nor environments nor the clients' metadata: the strategy, NumPy, and a folder for its checkpoints.
+It needs only the strategy, NumPy, and a folder for its checkpoints: no PyTorch, environments or clients' metadata.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sb3_fedguide.state.checkpoint_files import newest_checkpoint, remove_leftov
 
 logger = logging.getLogger(__name__)
 
-#: What of the server a checkpoint holds as it is.
+#: Attributes of the server that a checkpoint stores unchanged.
 _ATTRIBUTES = ("run_id", "round", "timesteps", "test_steps", "n_broadcasts", "n_setups", "outbox", "finished", "dismissed")
 __all__ = ["Server", "ServerConfig", "TooFewClients", "serve"]
 
@@ -40,15 +40,15 @@ RoundHook = Callable[[int, Mapping[str, float]], None]
 def serve(
     config: ServerConfig, transport: Transport, folder: str | Path | None = None, on_round: RoundHook | None = None
 ) -> Server:
-    """Run a federation to its end, from its checkpoint where there is one.
+    """Run a federation to its end, from its checkpoint if there is one.
 
     :param folder: where checkpoints and the table of evaluations are kept; ``None`` for neither
-    :param on_round: called after every round with the log of that round: what clients report under ``client_<k>/``, their
-        averages, and the server's own figures under ``federated/``; once more after the last round where clients evaluated
-        what it sent
-    :return: the server as it is at the end
+    :param on_round: called after every round with the log of that round: the clients' reports under ``client_<k>/``, their
+        averages, and the server's own figures under ``federated/``; once more after the last round if clients evaluated
+        the last broadcast
+    :return: the server at the end
     :raises TooFewClients: see :class:`ServerConfig`
-    :raises ClientError: where nothing that clients send before the first round can be used
+    :raises ClientError: if no payload of the clients before the first round is valid
     :raises ValueError: for the checkpoint of another federation
     """
     server = Server(config, transport, folder, on_round)
@@ -69,11 +69,11 @@ class Server:
         self.config, self.transport, self.on_round = config, transport, on_round
         self.folder = None if folder is None else Path(folder)
         strategy = make_strategy(config.algorithm, config.settings, config.n_clients, config.seed)
-        #: the strategy, who is outdated, and bytes
+        #: the strategy, outdated clients, and bytes
         self.coordinator = Coordinator(strategy)
-        #: who has joined, who was refused, who is ready to train
+        #: clients that have joined, were refused, or are ready to train
         self.clients = Clients(server_facts(config))
-        #: who was there at the last look
+        #: clients that were present at the last check
         self.present: set[int] = set()
         self.trunk: TrunkAverages | None = None
         #: complete rounds
@@ -81,17 +81,17 @@ class Server:
         #: environment steps of all clients together, tests included, after each round; and those of tests by client
         self.timesteps: list[int] = []
         self.test_steps: dict[int, int] = {}
-        #: exchanges in which clients received something
+        #: number of exchanges with a broadcast
         self.n_broadcasts = 0
-        #: tells this run from others with the same settings
+        #: distinguishes this run from others with the same settings
         self.run_id = uuid.uuid4().hex
-        #: what clients have not yet confirmed: number of the broadcast, the round it came after (0 for none), arrays
+        #: broadcasts that clients have not yet confirmed: number, the round before it (0 for none), arrays
         self.outbox: dict[int, tuple[int, int, Payload]] = {}
         #: requests that failed since the last round, by client
         self.failures: dict[int, str] = {}
         self.n_setups = 0
         self.finished = False
-        #: who has heard that the run is over
+        #: clients that know of the run's end
         self.dismissed: list[int] = []
         self._table = None if self.folder is None else GrowingTable(self.folder / EVALUATIONS)
 
@@ -109,7 +109,7 @@ class Server:
         self._finish()
 
     def _await_clients(self) -> None:
-        """Until enough clients with the same settings are there to begin."""
+        """Wait until enough clients with the same settings are present."""
         started = time.monotonic()
         while self.clients.common is None:
             self._welcome()
@@ -118,7 +118,7 @@ class Server:
                 self._pause(started, len(self.clients.joined), self.config.n_start)
 
     def _welcome(self) -> None:
-        """Look who is there, and ask those who are new for their settings."""
+        """Check which clients are present, and ask new ones for their settings."""
         self.present = set(self.transport.clients())
         newcomers = self.clients.newcomers(self.present)
         requests = {client: Message("join", 0, facts=self.clients.facts) for client in newcomers}
@@ -133,7 +133,7 @@ class Server:
 
     def _refuse(self, reasons: Mapping[int, str]) -> None:
         for client, reason in reasons.items():
-            logger.warning("client %d is refused: %s; put it right there, and let it come again", client, reason)
+            logger.warning("client %d is refused: %s; correct its configuration and restart it", client, reason)
 
     def _pretrain_trunk(self) -> None:
         settings = self.clients.common["trunk"] if self.clients.common is not None else None
@@ -176,7 +176,7 @@ class Server:
         self.coordinator.count(payload_bytes(uploads), payload_bytes(dict.fromkeys(replies, sent)), offline=True)
 
     def _preparations(self) -> dict[int, Message]:
-        """Requests to those who have not been through the offline stage."""
+        """Requests to clients that have not completed the offline stage."""
         request = Message("setup", 0, {} if self.trunk is None else self.trunk.payload())
         return {client: message for client, message in self._to_joined(request).items() if client not in self.clients.prepared}
 
@@ -229,7 +229,7 @@ class Server:
         self.failures = {}
 
     def _finish(self) -> None:
-        """Deliver what was sent last, and wait a while for those who are away; started again, it does so for who is left."""
+        """Deliver the last broadcast, and wait for absent clients for a while; after a restart, only for the missing ones."""
         started = time.monotonic()
         while away := self.clients.prepared.difference(self.dismissed):
             self._welcome()
@@ -245,10 +245,10 @@ class Server:
                 break
             time.sleep(self.config.poll if away.difference(self.dismissed) else 0.0)
         if away := self.clients.prepared.difference(self.dismissed):
-            logger.warning("clients %s have not heard that the run is over; start the server again for them", sorted(away))
+            logger.warning("clients %s do not know that the run is over; start the server again for them", sorted(away))
 
     def _report(self, round: int, replies: Mapping[int, Message], figures: dict[str, float] | None) -> None:
-        """Keep what clients measured, call the hook if it is to know, and write the checkpoint."""
+        """Store the clients' evaluations, call the hook unless ``figures`` is ``None``, and write the checkpoint."""
         evaluations = [
             evaluation
             for client, reply in sorted(replies.items())
@@ -278,11 +278,11 @@ class Server:
             logger.warning("round %d: %s", self.round + 1, complaint)
 
     def _there(self) -> list[int]:
-        """Who was there at the last look and is ready to train."""
+        """The clients that were present at the last check and are ready to train."""
         return sorted(self.present & self.clients.prepared & self.clients.joined.keys())
 
     def _to_prepared(self, kind: Kind, round: int, clients: Iterable[int]) -> dict[int, Message]:
-        """Requests with what each client has missed."""
+        """Requests with the payload that each client has missed."""
         requests = {}
         for client in clients:
             if client in self.coordinator.outdated:
@@ -297,10 +297,10 @@ class Server:
         timeout: float | None,
         fault: Callable[[Message], str | None] | None = None,
     ) -> dict[int, Message]:
-        """Replies of at least :attr:`ServerConfig.min_clients` clients; who is missing is asked again.
+        """Replies of at least :attr:`ServerConfig.min_clients` clients; missing clients are asked again.
 
-        :param requests: makes the requests to those who are there now
-        :param fault: what is wrong with a reply that does not count, if anything
+        :param requests: makes the requests to the clients that are present now
+        :param fault: the reason why a reply does not count, if any
         """
         started, replies = time.monotonic(), {}
         while True:
@@ -318,7 +318,7 @@ class Server:
     def _ask(
         self, requests: Mapping[int, Message], timeout: float | None, fault: Callable[[Message], str | None] | None = None
     ) -> dict[int, Message]:
-        """The replies that came; of the others it is noted why they did not."""
+        """The replies that arrived; for the other clients it records the reason."""
         if not requests:
             return {}
         requests = {
@@ -346,13 +346,13 @@ class Server:
 
     def _note_prepared(self, client: int) -> None:
         self.clients.prepared.add(client)
-        if self.n_broadcasts > 0:  # it has missed what the others received
+        if self.n_broadcasts > 0:  # it has missed a broadcast
             self.coordinator.outdated.add(client)
 
     def _pause(self, started: float, have: int, need: int) -> None:
-        """Wait before the next look.
+        """Wait before the next check of the present clients.
 
-        :raises TooFewClients: where that is over
+        :raises TooFewClients: after :attr:`ServerConfig.wait`
         """
         limit = self.config.wait
         if limit is not None and time.monotonic() - started >= limit:
@@ -376,7 +376,7 @@ class Server:
         write_checkpoint(self.folder / CHECKPOINTS, self.round, state)
 
     def _resume(self) -> None:
-        """Take the checkpoint, if there is one.
+        """Load the checkpoint, if there is one.
 
         :raises ValueError: for that of another federation
         """

@@ -33,27 +33,27 @@ logger = logging.getLogger(__name__)
 
 Answer = tuple[Payload, dict[str, Any]]
 
-#: What a client has learned when the run is over, in its folder: see :meth:`Federation.export_parameters`.
+#: The client's parameters after the run, in its folder: see :meth:`Federation.export_parameters`.
 PARAMETERS = "parameters.npz"
 #: In the folder of a deployed client, that of its :class:`Site`.
 SITE = "site"
 
 
 class Site:
-    """Answers the server's messages for one client; all that it remembers is in its folder after each of them.
+    """Answers the server's messages for one client; its whole state is in its folder after each message.
 
-    So a new process for every message does as well as one that stays, and a message that comes twice is answered from the
-    disk. After an exception this object is of no more use: a new one goes on from the disk.
+    So a new process can answer every message, and a message that arrives twice is answered from disk. After an exception
+    this object is unusable: a new one resumes from disk.
 
-    :param model: a federation of this one client, ``clients=[k]``, with its seed given and nothing learned yet
+    :param model: an untrained federation of this one client, ``clients=[k]``, with a seed
     :param n_rounds: rounds of the whole run
-    :param folder: this client's own, for nothing else
+    :param folder: used only for this client
     :param eval_freq: rounds between evaluations, as in :class:`~sb3_fedguide.common.evaluation.FederatedEvalCallback`;
         ``None`` for none
     :param n_episodes: episodes of an evaluation
-    :param report: tell the server the round's log and the evaluations' returns; otherwise nothing but uploads leaves
-    :raises ValueError: for a model of several clients, for a report beside uploads with noise, or a folder with another
-        client's or another run's state
+    :param report: send the server the round's log and the evaluations' returns; otherwise only uploads leave the client
+    :raises ValueError: for a model of several clients, for a report together with noise on uploads, or a folder with the
+        state of another client or run
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Site:
         self._evaluation = None if eval_freq is None or not report else _SiteEvaluation(n_rounds, eval_freq, n_episodes)
         self._learning: tuple[BaseCallback, list[RoundCallback]] | None = None
         self._trunk: TrunkTraining | None = None
-        #: what :meth:`Pretraining.trunk_training` took
+        #: the arguments of :meth:`Pretraining.trunk_training`
         self._trunk_arguments: dict[str, Any] = {}
         #: the run of the server that this client takes part in
         self.run: str | None = None
@@ -103,11 +103,11 @@ class Site:
 
     @property
     def prepared(self) -> bool:
-        """Whether this client has been through the offline stage."""
+        """Whether this client has completed the offline stage."""
         return self.model.pretrained
 
     def facts(self) -> dict[str, Any]:
-        """What this client says of itself when it joins."""
+        """The facts that this client sends when it joins."""
         model = self.model
         sizes = {"observations": model.observation_space, "actions": model.action_space}
         shapes = {**{name: list(space.shape or ()) for name, space in sizes.items()}, **model.upload_shapes()}
@@ -115,15 +115,15 @@ class Site:
         return {**self._identity(), "client": self.client_id, "shapes": shapes, "trunk": trunk}
 
     def handle(self, message: Message) -> Message:
-        """Do what the server asks, and answer; the answer has the same kind and round.
+        """Execute the server's request, and reply; the reply has the same kind and round.
 
-        Whatever it raises stays here: a transport sends :meth:`~sb3_fedguide.deployment.transport.Failure.of` instead.
+        An exception stays on this machine: a transport sends :meth:`~sb3_fedguide.deployment.transport.Failure.of` instead.
 
         :raises ValueError: for a message of another run, or of a server that has gone back in this one
         :raises RuntimeError: after an exception
         """
         if not self._is_usable:
-            raise RuntimeError("an error has left this client in the middle of a message; a new Site goes on from the disk")
+            raise RuntimeError("an error interrupted this client's last message; make a new Site, which resumes from disk")
         if self.run not in (None, message.facts[RUN]):
             raise ValueError(
                 f"{self.folder} holds the state of another run of the server; give this client a new folder for a new run"
@@ -158,7 +158,7 @@ class Site:
         return self._reply
 
     def _refuse_older(self, message: Message) -> None:
-        """A server that is where it was before this client's last message would have it train twice, on what it gave since.
+        """Refuse a server that went back to a state before this client's last message: the client would train twice.
 
         :raises ValueError: for its message
         """
@@ -171,7 +171,7 @@ class Site:
             )
 
     def _join(self, message: Message) -> Message:
-        """Nothing of it stays: a client that is refused can be put right in the same folder."""
+        """Nothing is stored: a refused client can join with corrected settings in the same folder."""
         facts = self.facts()
         if other := difference(facts, message.facts, SERVER_FACTS, "the server's"):
             logger.warning("the server will refuse client %d: %s", self.client_id, other)
@@ -189,7 +189,7 @@ class Site:
         assert self._trunk is not None
         if trunk := take_prefix(message.payload, TRUNK):
             self._trunk.receive(trunk)
-        self._trunk.n_done = message.facts["n_done"]  # who has missed something goes on with the others' learning rate
+        self._trunk.n_done = message.facts["n_done"]  # a client that missed something continues with the others' learning rate
         self._trunk.run(message.facts["average_every"])
         return self._trunk.uploads()[0], {}
 
@@ -209,7 +209,7 @@ class Site:
     def _play_round(self, message: Message) -> Answer:
         callbacks, hooks = self._learn()
         evaluations, model = self._receive(message), self.model
-        # Every schedule follows the federation's rounds, whoever took part in them.
+        # Every schedule follows the federation's rounds, also those without this client.
         model.round = message.round - 1
         model.num_timesteps = model.round * model.rollout_size
         with in_round(message.round):
@@ -231,7 +231,7 @@ class Site:
         return {}, {"evaluations": evaluations}
 
     def _receive(self, message: Message) -> list[dict[str, Any]]:
-        """Take what the server sent, unless it came already; its evaluation, where one is due."""
+        """Take the server's broadcast, unless it has arrived already; return its evaluation, if one is due."""
         number, after = message.facts["broadcast"], message.facts["after"]
         if not message.payload or number == self.n_received:
             return []
@@ -249,7 +249,7 @@ class Site:
         return ClientEvaluation(self.client_id, round, policy, returns, lengths, successes).facts()
 
     def _learn(self) -> tuple[BaseCallback, list[RoundCallback]]:
-        """Begin to learn, or go on, with the first message that needs it."""
+        """Begin to train, or resume, with the first message that needs it."""
         if self._learning is None:
             model = self.model
             _, callbacks, hooks = model.start_learning(
@@ -285,9 +285,9 @@ class Site:
         write_checkpoint(self.folder, self.n_answered, state)
 
     def _load(self) -> None:
-        """Take the state in the folder, if there is one.
+        """Load the state in the folder, if there is one.
 
-        :raises ValueError: where it is another client's or another run's
+        :raises ValueError: if it is another client's or another run's
         """
         remove_leftovers(self.folder)
         found = newest_checkpoint(self.folder)
@@ -309,7 +309,7 @@ class Site:
 
 
 class _SiteEvaluation(FederatedEvalCallback):
-    """Evaluates what is deployed; what the server sends comes with the next message, and its environments with their use."""
+    """Evaluates the deployed policy. The broadcast policy comes with the next message; environments are made when needed."""
 
     def _on_training_start(self) -> None:
         pass

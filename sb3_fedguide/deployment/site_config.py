@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class SiteConfig(BaseModel):
-    """What a client's configuration may say; ``algo``, ``client``, ``seed`` and one of ``env`` and ``metadata`` it must say.
+    """A client's configuration; ``algo``, ``client``, ``seed`` and one of ``env`` and ``metadata`` are required.
 
     :param algo: command-line name of the algorithm
     :param env: name of the family
@@ -33,7 +33,7 @@ class SiteConfig(BaseModel):
     :param n_rounds: instead of the configuration's
     :param eval_freq: rounds between evaluations; 0 for none
     :param eval_episodes: episodes of each
-    :param report: tell the server losses and returns
+    :param report: send losses and returns to the server
     :param packages: as ``--gym-packages``
     """
 
@@ -84,11 +84,11 @@ def read_site_config(config: Mapping[str, Any]) -> SiteConfig:
 def make_client(checked: SiteConfig) -> tuple[Federation, int]:
     """The client's federation of one, and the rounds of the run.
 
-    :raises ValueError: where the settings do not fit together, or there is no such client
+    :raises ValueError: if the settings do not fit together, or there is no such client
     """
     import torch as th
 
-    th.set_num_threads(1)  # as in training by the command line, of which a run over a network is to be the same
+    th.set_num_threads(1)  # as in training by the command line, which gives the same results as a run over a network
     family = fed_envs.load_family(checked.env or Path(str(checked.metadata)).absolute())
     overrides = {**checked.params, **({} if checked.n_rounds is None else {"n_rounds": checked.n_rounds})}
     settings = resolve(str(checked.algo), family, checked.conf, checked.env, overrides)

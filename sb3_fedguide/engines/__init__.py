@@ -18,7 +18,7 @@ def make_engine(name: str, num_actors: int, address: str | None = None) -> Engin
 
     :param num_actors: groups of clients that train at the same time
     :param address: of a Ray cluster; a local one is started if ``None``
-    :raises ValueError: for an unknown name, a number below one, or Ray where it is not installed
+    :raises ValueError: for an unknown name, a number below one, or if Ray is not installed
     """
     if name not in ENGINES:
         raise ValueError(f"engine={name!r} must be one of {', '.join(ENGINES)}")

@@ -25,10 +25,10 @@ class EngineError(RuntimeError):
 
 
 class Engine(ABC):
-    """Divides the clients into groups that train at the same time; server, evaluation and log stay where they are.
+    """Divides the clients into groups that train at the same time; server, evaluation and log stay in the main process.
 
-    Workers keep nothing between rounds, but environments that give no state: each round, a group's state goes to its worker
-    and comes back trained. So a run has the same results, checkpoints and files with every engine and any number of workers.
+    Workers keep nothing between rounds, except environments that give no state: in each round, a group's state goes to its
+    worker and comes back trained. A run has equal results, checkpoints and files with every engine and any number of workers.
 
         with Processes(2) as engine:
             engine.attach(model)
@@ -45,7 +45,7 @@ class Engine(ABC):
     def attach(self, model: Federation) -> None:
         """Let the workers train ``model``'s clients from its next round on.
 
-        :raises ValueError: where the model or its environments cannot be sent to other processes
+        :raises ValueError: if the model or its environments cannot be sent to other processes
         """
         if model.device.type != "cpu":
             raise ValueError(f"engines train on CPUs, and the device is {model.device}; use device='cpu', or no engine")
@@ -54,7 +54,7 @@ class Engine(ABC):
         for engine in {self, model.engine or self}:
             engine.close()
         n_groups = min(self.num_actors, model.n_clients)
-        # Neighbours are often alike and as slow as each other, so that every n-th client makes groups of equal length.
+        # Neighbours often need similar time, so groups of every n-th client take equally long.
         self.groups = [list(range(first, model.n_clients, n_groups)) for first in range(n_groups)]
         self._start([describe(model, group) for group in self.groups])
         model.engine, self._model = self, model
@@ -88,9 +88,9 @@ class Engine(ABC):
         self.close()
 
     def train_round(self, model: Federation, callbacks: BaseCallback) -> bool:
-        """One round of ``model``'s clients that take part; afterwards it is as if they had trained here.
+        """One round of ``model``'s participants; afterwards the model is the same as if they had trained here.
 
-        :raises ClientError: where a client's environment or policy broke
+        :raises ClientError: if a client's environment or policy failed
         :raises EngineError: for a worker that is lost
         :raises ValueError: for callbacks that count environment steps
         """
@@ -105,7 +105,7 @@ class Engine(ABC):
         try:
             trained = self._train({k: Round(parts[k], model._total_timesteps, steps_at_once) for k in active})
         except BaseException:
-            self.close()  # a worker that has not been heard would answer the next round with this one's result
+            self.close()  # a worker with an unread reply would answer the next round with this round's result
             raise
         for reply in trained.values():
             if isinstance(reply, ClientError):
@@ -129,14 +129,14 @@ class Engine(ABC):
         groups = [self.groups[trained], *self.groups[:trained], *self.groups[trained + 1 :]]
         order = [position for group in groups for position in group]
         joined = join_clients(parts, SHARED_ENTRIES)
-        # Gradient steps that any client took part in: in each round, who begins later takes part until the end.
+        # Gradient steps in which any client took part: in each round, a client that begins later takes part until the end.
         joined["attributes"]["_n_updates"] = max(part["attributes"]["_n_updates"] for part in parts)
         joined = take_clients(joined, np.argsort(order).tolist(), model.n_clients, SHARED_ENTRIES)
         # What belongs to the process and the server has not changed.
         model.load_state({**joined, **{name: state[name] for name in ("identity", "strategy", "random")}})
 
     def _record(self, model: Federation, replies: dict[int, Trained]) -> None:
-        """Log what the workers logged: clients' own values as they are, others averaged over those that took part."""
+        """Log the workers' values: those of single clients unchanged, others averaged over the participants."""
         values: dict[str, list[tuple[float, int]]] = {}
         excluded: dict[str, Any] = {}
         for k, reply in replies.items():

@@ -29,7 +29,7 @@ class Processes(Engine):
     def _start(self, blobs: Sequence[bytes]) -> None:
         context = multiprocessing.get_context("spawn")
         atexit.register(self._end)  # before multiprocessing's own, which waits for workers after a SIGTERM
-        # One thread each: what several libraries start by themselves gets into the other workers' way.
+        # One thread each: the threads that libraries start by default slow the other workers down.
         before = os.environ.get("OMP_NUM_THREADS")
         os.environ["OMP_NUM_THREADS"] = "1"
         try:
@@ -90,7 +90,7 @@ def _received(pipe: Connection) -> Any:
 
 def _work(pipe: Connection, blob: bytes) -> None:
     """A worker process: a round for every message, until the pipe is closed."""
-    # A terminal and a service manager signal all processes; to stop is the main process's, which closes the pipe.
+    # A terminal and a service manager signal all processes; only the main process stops the worker, by closing the pipe.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     try:

@@ -13,20 +13,20 @@ from sb3_fedguide.engines.engine import Engine, EngineError
 from sb3_fedguide.engines.worker import Round, Trained, Worker
 
 _CONNECT_SECONDS = 10.0
-#: How long Ray may take to start an actor anew, on another node if its own is gone (17 s were seen).
+#: How long Ray may take to restart an actor, on another node if its own is gone (17 s were measured).
 RESTART_SECONDS = 120.0
 
 
 class RayActors(Engine):
     """One Ray actor per group of clients, spread over the nodes.
 
-    An actor keeps nothing, so that a round that was lost with its actor, or with its whole node, is trained again by the
-    actor that Ray starts in its place, with the same result.
+    An actor keeps nothing. So if a round is lost with its actor, or with its whole node, the actor that Ray starts in its
+    place trains it again, with the same result.
 
     :param num_actors: actors; no more than there are clients. Each takes one CPU.
     :param address: of a running cluster, such as ``"auto"`` or ``"10.0.0.1:6379"``; a cluster on this machine is started if
         ``None``
-    :raises ValueError: where Ray is not installed; from :meth:`attach`, where the cluster has fewer CPUs
+    :raises ValueError: if Ray is not installed; from :meth:`attach`, if the cluster has fewer CPUs
     """
 
     def __init__(self, num_actors: int, address: str | None = None) -> None:
@@ -70,7 +70,7 @@ class RayActors(Engine):
         return {k: self._trained(k, rounds[k], reply) for k, reply in waiting.items()}
 
     def _trained(self, k: int, round: Round, reply: Any) -> Any:
-        """Wait for a group's reply; the round is sent again to an actor that Ray has started anew."""
+        """Wait for a group's reply; if Ray has restarted the actor, the round is sent again."""
         ray = self._ray
         lost_since: float | None = None
         while True:
@@ -100,9 +100,9 @@ class RayActors(Engine):
 
 
 def _check_address(address: str | None) -> None:
-    """Ray itself tries for minutes to reach a cluster that is not there.
+    """Check the address first: Ray itself tries for minutes to reach a missing cluster.
 
-    :raises ValueError: where nobody listens at ``host:port``
+    :raises ValueError: if no process listens at ``host:port``
     """
     host, _, port = (address or "").rpartition(":")
     if not host or "/" in host or not port.isdecimal():

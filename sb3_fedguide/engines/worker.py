@@ -1,4 +1,4 @@
-"""One group of clients in a process of its own: it gets their state and trains them for a round."""
+"""One group of clients in a separate process: it receives their state and trains them for a round."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from sb3_fedguide.state.held import held_by
 
 
 class Round(NamedTuple):
-    """What a worker is told of a round.
+    """The request of a round to a worker.
 
     :param state: of its clients
     :param total_timesteps: of the whole training, all clients together
-    :param steps_at_once: environment steps that one step of the round counts, all clients together
+    :param steps_at_once: environment steps of all clients together in one step of the round
     """
 
     state: State
@@ -33,12 +33,12 @@ class Round(NamedTuple):
 
 
 class Trained(NamedTuple):
-    """What comes back.
+    """A worker's reply.
 
     :param state: of its clients, after the round
-    :param metrics: what was logged, with the outputs that each value is kept from
-    :param restarted: clients whose episodes had to begin anew
-    :param observations: what the actors saw, ``(n_steps, n_clients, n_envs, obs_dim)``; ``None`` off policy
+    :param metrics: the logged values, each with the outputs that exclude it
+    :param restarted: clients whose episodes had to restart
+    :param observations: the actors' inputs, ``(n_steps, n_clients, n_envs, obs_dim)``; ``None`` off policy
     """
 
     state: State
@@ -48,9 +48,9 @@ class Trained(NamedTuple):
 
 
 class Worker:
-    """Keeps nothing between two rounds but environments that give no state: any worker can go on with any group's state.
+    """Keeps nothing between two rounds, except environments that give no state: any worker can train any group.
 
-    In a worker that has not stepped them, such environments begin new episodes.
+    In another worker such environments begin new episodes.
 
     :param blob: what :func:`describe` returned for its clients
     """
@@ -93,9 +93,9 @@ class Worker:
 
 
 def describe(model: Federation, positions: Sequence[int]) -> bytes:
-    """What a :class:`Worker` needs to be made of the clients at ``positions``; their state comes with each round.
+    """The arguments of a :class:`Worker` for the clients at ``positions``; their state comes with each round.
 
-    :raises ValueError: where the environments' functions cannot be sent to another process
+    :raises ValueError: if the environments' functions cannot be sent to another process
     """
     env = model._federated_env()
     source = env.family if env.family is not None else env._factories

@@ -1,1 +1,1 @@
-"""What a run shows of itself: the paper's diagnostics, TensorBoard's charts and hyperparameters, pictures."""
+"""Monitoring of a run: the paper's diagnostics, TensorBoard's charts and hyperparameters, pictures."""

@@ -22,9 +22,9 @@ NO_PICTURES = ("stdout", "log", "json", "csv")
 
 
 class TensorBoardCallback(RoundCallback):
-    """Charts, hyperparameters and pictures of a run, beside the scalars that it logs anyway.
+    """Charts, hyperparameters and pictures of a run, beside its scalars.
 
-    * Custom Scalars: what belongs together in one chart, see :func:`~sb3_fedguide.monitoring.charts.chart_layout`.
+    * Custom Scalars: related keys in one chart, see :func:`~sb3_fedguide.monitoring.charts.chart_layout`.
     * HParams: the hyperparameters, with returns at the end as metrics.
     * Images: how the clients differ, at the start; the transport plan and, on Bandit2D, the densities of policies and priors.
 
@@ -32,8 +32,8 @@ class TensorBoardCallback(RoundCallback):
 
     :param n_rounds: rounds of the whole run; the last one is always drawn
     :param picture_freq: rounds between pictures; 0 for none
-    :param hyperparameters: what to show in the HParams tab; nested ones get dotted names
-    :param other_hyperparameters: names of those that other runs have, so that runs of several algorithms share a table
+    :param hyperparameters: for the HParams tab; nested ones get dotted names
+    :param other_hyperparameters: names of other runs' hyperparameters, so that runs of several algorithms share a table
     :raises ValueError: for a negative ``picture_freq``
     """
 
@@ -91,7 +91,7 @@ class TensorBoardCallback(RoundCallback):
         return isinstance(self.model, FederatedPPO) and family is not None and family.world == "bandit2d"
 
     def _draws(self, round: int) -> bool:
-        """Whether there are pictures of this round: of the first, every ``picture_freq``-th and the last."""
+        """Whether this round has pictures: the first, every ``picture_freq``-th and the last."""
         if self._writer is None or self.picture_freq == 0:
             return False
         return round in (1, self.n_rounds) or round % self.picture_freq == 0

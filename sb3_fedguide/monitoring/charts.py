@@ -1,4 +1,4 @@
-"""What TensorBoard is told once per run: which keys belong into one chart, and the run's hyperparameters."""
+"""Summaries that TensorBoard receives once per run: the keys of each chart, and the run's hyperparameters."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from sb3_fedguide.server.svrpg import SVRPG
 #: Category to chart to keys.
 Layout = dict[str, dict[str, list[str]]]
 
-#: What a run is judged by in the HParams tab, from its own time series; what a run does not log stays empty there.
+#: Metrics of the HParams tab, from the run's own time series; a metric that a run does not log stays empty.
 METRICS = ("eval/mean_reward", "eval/worst_client", "eval/broadcast_mean_reward", "rollout/ep_rew_mean")
 
-#: TensorBoard shows five columns at first: those that are said to differ between runs, then by name.
+#: TensorBoard shows five columns at first: those marked as different between runs, then by name.
 SHOWN_FIRST = ("algo", "family", "seed", "n_rounds", "learning_rate")
 
 _RETURNS: Layout = {
@@ -147,9 +147,9 @@ def layout_summary(layout: Layout) -> Any:
 
 
 def flatten(hyperparameters: Mapping[str, Any], prefix: str = "") -> dict[str, bool | float | str]:
-    """Nested hyperparameters under dotted names; lists and anything else that HParams does not know become text.
+    """Nested hyperparameters under dotted names; lists and other types that HParams does not know become text.
 
-    What is ``None`` is left out.
+    ``None`` is left out.
     """
     flat: dict[str, bool | float | str] = {}
     for name, value in hyperparameters.items():
@@ -165,8 +165,8 @@ def session_start(
 ) -> list[Any]:
     """The summaries that TensorBoard's HParams tab reads; metrics are the last values of the run's own time series.
 
-    TensorBoard takes the columns of all runs from the first one that it finds, so that runs of different algorithms can
-    only be compared where each also names the hyperparameters of the ``others``.
+    TensorBoard takes the columns of all runs from the first run that it finds. So runs of different algorithms can be
+    compared only if each also names the hyperparameters of the ``others``.
     """
     from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 

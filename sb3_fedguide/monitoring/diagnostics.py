@@ -1,4 +1,4 @@
-"""Quantities of the paper's theory that nothing in training needs; Lemma 2's are in ``common.value_blend``."""
+"""Quantities of the paper's theory that training does not need; Lemma 2's are in ``common.value_blend``."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ N_STATES = 256
 def policy_divergences(model: FederatedPPO, n_states: int = N_STATES) -> np.ndarray:
     """``E_s KL(pi_i || pi_bar)`` of each client that takes part in the round (paper, Theorem 3, Eq. policy-dispersion).
 
-    ``pi_bar`` has the average of their actors' parameters, each client seeing states as its own normalisation shows them;
-    the expectation is over evenly spaced states of the client's last rollout. The dispersion ``Gamma_pi`` is the mean of
-    what is returned, since every client has equally many samples.
+    ``pi_bar`` has the average of their actors' parameters, each client with its own normalisation of states; the
+    expectation is over evenly spaced states of the client's last rollout. The dispersion ``Gamma_pi`` is the mean of the
+    returned values, since every client has equally many samples.
 
     :return: ``(n_present,)``
     """
@@ -52,7 +52,7 @@ def average_actor(model: FederatedPPO) -> Parameters:
 
 @contextmanager
 def averaged(model: FederatedPPO) -> Iterator[None]:
-    """The model with the average of its actors for a while; afterwards each client has its own again."""
+    """Inside this context all clients have the average of the actors; afterwards each has its own again."""
     own = snapshot(model.policy, ACTOR_PREFIXES)
     try:
         _put(model, average_actor(model))
@@ -68,7 +68,7 @@ def _put(model: FederatedPPO, parameters: Parameters) -> None:
 
 
 class CostProxy(NamedTuple):
-    """How well distances between heads stand in for distances between scores (paper, assumption A5).
+    """How well distances between heads approximate distances between scores (paper, assumption A5).
 
     :param error: epsilon_C, the largest difference of the two costs, both scaled as the server does
     :param correlation: over all pairs of a client and an expert; NaN where one of the costs is constant
@@ -90,7 +90,7 @@ def compare_costs(param: np.ndarray, score: np.ndarray, scaling: str = "max") ->
 
 
 def cost_proxy(model: FedGuide) -> CostProxy:
-    """Costs of ``cost: param`` against those of ``cost: score``, between the clients' heads and the experts they last got."""
+    """Costs of ``cost: param`` against those of ``cost: score``, between the clients' heads and their last experts."""
     clients = np.flatnonzero(model.present)
     param = np.concatenate([head_costs(model.heads[i, None], model.experts[i]) for i in clients])
     score = np.stack([score_cost(model.heads[i], model.experts[i], model.score_moments[i]) for i in clients])
@@ -100,10 +100,10 @@ def cost_proxy(model: FedGuide) -> CostProxy:
 class DiagnosticsCallback(RoundCallback):
     """Logs the policies' dispersion after local training and how the two transport costs compare after the exchange.
 
-    Nothing is drawn from training's random streams and no parameter changes: training goes on as without it.
+    It uses no random stream of training and changes no parameter, so training is the same as without it.
 
     :param evaluation: this run's evaluation, which comes before this callback; with it, the average of the policies is
-        evaluated in the same rounds where the method itself sends no policy (Theorem 3's other side)
+        evaluated in the same rounds if the method itself sends no policy (Theorem 3's other side)
     """
 
     def __init__(self, evaluation: FederatedEvalCallback | None = None) -> None:

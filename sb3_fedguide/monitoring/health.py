@@ -1,4 +1,4 @@
-"""Warnings of a run that goes wrong, in the round in which it begins to: with whom, why, and what to try."""
+"""Warnings in the first round in which a client's training goes wrong: which client, why, and what to try."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.federated_ppo import FederatedPPO
 from sb3_fedguide.common.federation import Federation
 
-#: Importance weights of fewer effective states than this share of them have collapsed.
+#: Importance weights have collapsed if their effective sample share is below this.
 LEAST_SAMPLE_SHARE = 0.01
 #: V_phi misleads below this: rounding alone makes a constant V_phi negative.
 LEAST_EXPLAINED_VARIANCE = -0.05
@@ -24,9 +24,9 @@ ONE_EXPERT = 0.99
 
 
 class HealthCheck(NamedTuple):
-    """Something that goes wrong with clients one by one.
+    """A check of each client.
 
-    :param key: what is logged of each client, after ``client_<k>/``
+    :param key: log key of the value, after ``client_<k>/``
     :param is_wrong: whether such a value is wrong; NaN is not
     :param reason: what it means
     :param remedy: what to try, given the model's settings
@@ -84,9 +84,9 @@ def routes_one_to_one(rows: np.ndarray) -> bool:
 
 
 class HealthCallback(RoundCallback):
-    """Warns of what goes wrong with a run: once of each check and client, however long it lasts.
+    """Warns if a client's training goes wrong: once for each check and client.
 
-    The values are those of the log, per client; nothing of the training changes. A run that was resumed warns again.
+    The values are those of the log, per client; training does not change. A resumed run warns again.
     """
 
     def __init__(self) -> None:

@@ -13,11 +13,11 @@ from fed_envs.metadata_figures import MAX_ANNOTATED, MAX_LABELS, MAX_ROWS, annot
 from sb3_fedguide.benchmark.bandit2d import Policies, Priors
 from sb3_fedguide.benchmark.figures.bandit2d import draw_density, draw_outline
 
-#: TensorBoard shows a picture about this wide beside others (inches); what is drawn wider gets too small to read.
+#: TensorBoard shows a picture about this wide beside others (inches); a wider figure becomes too small to read.
 WIDTH = 4.4
 DPI = 90
 COLUMNS = 3
-#: Densities are drawn of the first so many clients: every one has axes of its own, which take long to draw.
+#: Largest number of clients whose densities are drawn: each has its own axes, which take long to draw.
 MAX_DENSITIES = 30
 LEGEND = "colour: policy\n+: its mean\ndashed: the client's\nprior, 2 deviations"
 
@@ -45,7 +45,7 @@ def transport_plan(rows: np.ndarray, client_ids: Sequence[int]) -> np.ndarray:
 
 
 def heterogeneity(family: Family, client_ids: Sequence[int]) -> np.ndarray | None:
-    """How the clients differ, see :func:`~fed_envs.metadata_figures.heterogeneity`; ``None`` where no number differs."""
+    """How the clients differ, see :func:`~fed_envs.metadata_figures.heterogeneity`; ``None`` if no number differs."""
     figure = metadata_figures.heterogeneity(family, client_ids, width=WIDTH)
     return None if figure is None else _rgb(figure)
 
@@ -55,11 +55,11 @@ def bandit_densities(
 ) -> np.ndarray:
     """Bandit2D's policies as densities over actions, with the clients' personal priors and the global one where given.
 
-    Of more than :data:`MAX_DENSITIES` clients the first are drawn, and the title says so.
+    With more than :data:`MAX_DENSITIES` clients only the first are drawn, and the title says so.
 
     :param policies: of the clients after local training
     :param priors: on :func:`~sb3_fedguide.benchmark.figures.bandit2d.grid`
-    :param broadcast: what the server sent after it
+    :param broadcast: the server's broadcast policies after it
     """
     from sb3_fedguide.benchmark.figures.bandit2d import grid
 

@@ -29,7 +29,7 @@ class PlanCallback(RoundCallback):
         return {} if self.table.size is None else {"csv_size": self.table.size}
 
     def load_state(self, state: State) -> None:
-        """:raises ValueError: where rows are missing that the state counts on"""
+        """:raises ValueError: if rows are missing that the state counts on"""
         self.table.cut(state["csv_size"])
 
     def _on_training_start(self) -> None:

@@ -1,4 +1,4 @@
-"""Behaviour policies: medium-quality policies of the nominal backbones that make the offline data on the spot.
+"""Behaviour policies: medium-quality policies of the nominal backbones that generate the offline data.
 
 A policy is a small tanh network whose Gaussian action ``u`` is executed as ``tanh(u)``. A policy that is clipped instead
 puts atoms at +-1, which no density model of the actions can represent. The files hold plain arrays and are read without

@@ -76,7 +76,7 @@ def _clone_group(
     learning_rate: float,
     progress: StepProgress | None,
 ) -> np.ndarray:
-    """What :func:`clone` says, for clients that are updated in lockstep."""
+    """As :func:`clone`, for clients that are updated in lockstep."""
     sizes = [len(rows) for rows in observations]
     starts = np.cumsum([0, *sizes[:-1]])
     obs_table = th.from_numpy(np.concatenate(observations).astype(np.float32))

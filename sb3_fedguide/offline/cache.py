@@ -53,7 +53,7 @@ def cached_arrays(
     build: Callable[[], Mapping[str, np.ndarray]] | None = None,
     expected: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray] | None:
-    """The entry at ``path``; built and kept first if it is absent, damaged or has not the arrays expected.
+    """The entry at ``path``; built and stored first if it is missing, damaged or lacks the expected arrays.
 
     :param build: makes the entry; without it ``None`` is returned instead
     :param expected: arrays with the entry's names, dtypes and shapes
@@ -75,7 +75,7 @@ def cached_arrays(
 
 
 def keep_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a cache entry; where that fails there is a warning, since what was computed is right without it."""
+    """Write a cache entry; a failure only gives a warning, since the computed result is still valid."""
     try:
         write_arrays(path, arrays)
     except OSError as error:
@@ -95,7 +95,7 @@ def warn_not_kept(path: Path, error: Exception) -> None:
 def check_cache_folder(folder: Path) -> None:
     """:raises ValueError: if there is no such cache and none can be made; nothing is created
 
-    A folder that exists but cannot be written to is taken: entries can be read from it.
+    A folder without write permission is accepted: entries can be read from it.
     """
     existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not existing.is_dir():

@@ -1,4 +1,4 @@
-"""Makes a client's offline data on the spot, by acting in the client's own MDP."""
+"""Generates a client's offline data by acting in the client's own MDP."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def default_size(family: Family) -> int:
 
 
 def source_key(family: Family, client: int, policy: BehaviorPolicy | None = None) -> dict[str, Any]:
-    """Everything but size and seed that the data of one client depend on; nothing of the other clients is in it."""
+    """Everything except size and seed on which the data of one client depend; nothing of the other clients."""
     world = environment_class(family.world)
     if policy is None and world.scripted_policy(family, client) is not None:
         source: dict[str, Any] = {"script_version": world.script_version}
@@ -50,7 +50,7 @@ def source_key(family: Family, client: int, policy: BehaviorPolicy | None = None
 
 
 def check_source(family: Family, client: int) -> None:
-    """:raises ValueError: where nothing is known that could make the client's data"""
+    """:raises ValueError: if the package has no behaviour policy for the client's data"""
     if family.world == "gymnasium":
         raise ValueError(
             f"{family.client(client).id} brings no offline data: give a Minari dataset with --dataset ID_OR_PATH, in Python "  # type: ignore[attr-defined]
@@ -62,7 +62,7 @@ def check_source(family: Family, client: int) -> None:
 
 
 def behavior_name(family: Family, client: int, policy: BehaviorPolicy | None = None) -> str:
-    """What acts in a client's data, for people."""
+    """The name of the behaviour policy of a client's data."""
     scripted = policy is None and environment_class(family.world).scripted_policy(family, client) is not None
     return f"scripted policy of {family.backbone}" if scripted else "squashed PPO, medium"
 
@@ -72,8 +72,8 @@ def collect(
 ) -> tuple[OfflineData, gym.spaces.Box, gym.spaces.Box]:
     """Roll out a client's behaviour in its own MDP.
 
-    The world's scripted policy acts where it has one, the backbone's shipped policy elsewhere. Stored actions are those that
-    the environment was given, strictly inside the bounds.
+    The world's scripted policy acts if it has one, else the backbone's shipped policy. Stored actions are the environment's
+    inputs, strictly inside the bounds.
 
     :param size: rows
     :param seed: with ``client`` it determines everything that is random

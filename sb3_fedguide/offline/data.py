@@ -23,7 +23,7 @@ class OfflineData:
     :param rewards: in the environment's own scale, float32, ``(n,)``
     :param next_observations: float32, ``(n, obs_dim)``; the final observation where an episode ends
     :param terminations: bool, ``(n,)``; a time limit is not a termination
-    :param truncations: bool, ``(n,)``, where a time limit or the end of the record cut an episode; ``None`` where the
+    :param truncations: bool, ``(n,)``, where a time limit or the end of the record cut an episode; ``None`` if the
         observations tell: a row that does not lead to the next one is its episode's last
     :raises ValueError: for arrays that do not fit together, are empty or not finite
     """
@@ -57,7 +57,7 @@ class OfflineData:
             cut = np.ascontiguousarray(self.truncations, dtype=bool)
             if cut.shape != (len(self),):
                 raise ValueError(f"offline data: truncations need shape {(len(self),)}, got {cut.shape}")
-            # What the observations say already is not kept, so that the same data have one content.
+            # Truncations that follow from the observations are not kept, so that the same data have the same hash.
             object.__setattr__(self, "truncations", cut if (cut & ~self._seen_ends()).any() else None)
 
     def __len__(self) -> int:
@@ -76,11 +76,11 @@ class OfflineData:
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 of the arrays; what is computed from the data is cached under it."""
+        """SHA-256 of the arrays; results of the data are cached under it."""
         return arrays_hash(self.arrays())
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays by name; truncations where they say more than the observations."""
+        """The arrays by name; truncations only if they do not follow from the observations."""
         arrays = {name: getattr(self, name) for name in _FIELDS}
         return arrays if self.truncations is None else {**arrays, "truncations": self.truncations}
 
@@ -92,8 +92,8 @@ class OfflineData:
     def discounted_returns(self, gamma: float, bootstrap: np.ndarray | None = None) -> np.ndarray:
         """Return-to-go of every row, float64, ``(n,)``.
 
-        :param bootstrap: values ``(n,)`` of ``next_observations``, used where an episode was cut by a time limit or the
-            end of the record; by default what the data's mean reward would earn for ever
+        :param bootstrap: values ``(n,)`` of ``next_observations``, used if an episode was cut by a time limit or the
+            end of the record; by default the infinite-horizon return of the data's mean reward
         """
         if bootstrap is None:
             bootstrap = np.full(len(self), self.rewards.mean(dtype=np.float64) / (1.0 - gamma))

@@ -1,4 +1,4 @@
-"""The clients' offline datasets: Minari datasets made on the spot and cached, or any other ones with matching spaces."""
+"""The clients' offline datasets: generated and cached Minari datasets, or any others with matching spaces."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ def client_datasets(
     policy: BehaviorPolicy | None = None,
     progress: StepProgress | None = None,
 ) -> list[OfflineData]:
-    """Every client's offline data; what a client gets does not depend on which other clients are asked for.
+    """Every client's offline data; a client's data do not depend on the other clients in ``clients``.
 
-    :param family: a family's name, metadata file or object; ``None`` for environments of one's own (these need ``dataset``)
+    :param family: a family's name, metadata file or object; ``None`` for the user's own environments (these need ``dataset``)
     :param size: rows per client; default 20,000, or 1,000 for Bandit2D. A given dataset is cut to ``size`` rows (whole
         episodes in an order drawn per client), and used entirely by default
     :param seed: the federation's seed
     :param cache_dir: default ``$FEDGUIDE_CACHE`` or ``~/.cache/fedguide``
     :param dataset: a Minari dataset instead, by id or path; ``{client}`` in it stands for the client's number
-    :param clients: the clients asked for; default all of the family
+    :param clients: the requested clients; default all of the family
     :param env_spaces: observation and action space that a given dataset must fit; default those of each client
     :param policy: a behaviour policy instead of the shipped one
     :param progress: called with the clients done and their number
@@ -168,7 +168,7 @@ def _is_valid(folder: Path) -> bool:
 def _given(dataset: str, client: int, size: int | None, seed: int, env_spaces: tuple[gym.Space, gym.Space]) -> OfflineData:
     data_path = find_dataset(dataset.replace("{client}", str(client)))
     check_spaces(data_path, *env_spaces)
-    # An order of its own for each client: several that share one dataset then do not get the same part of it.
+    # Each client has its own order: several clients of one dataset then do not get the same part of it.
     rng = stream(seed, Role.DATA, client) if size is not None else None
     return read_minari(data_path, size, rng)
 

@@ -1,6 +1,6 @@
 """Clients in groups that train at the same time, one on each core.
 
-What a client learns does not depend on who trains beside it, so neither does it depend on the groups.
+A client's result does not depend on the other clients, and so not on the groups.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def train_together(
 ) -> list[Result]:
     """Run the groups' jobs at the same time, each in a thread; PyTorch and NumPy hold no lock while they compute.
 
-    :param jobs: each gets a function to report its progress to; all report the same totals
-    :param progress: told how far the slowest job is
+    :param jobs: each gets a function to which it reports its progress; all report the same totals
+    :param progress: called with the progress of the slowest job
     :return: the results, in the order of the jobs
-    :raises BaseException: what a job raised, or an interrupt of the caller; the other jobs then end at their next report
+    :raises BaseException: a job's exception, or an interrupt of the caller; the other jobs then end at their next report
     """
     if len(jobs) == 1:
         return [jobs[0](progress)]

@@ -1,4 +1,4 @@
-"""Minari datasets from arrays or from logs of one's own, without Minari's data collector."""
+"""Minari datasets from arrays or from the user's own logs, without Minari's data collector."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sb3_fedguide.offline.minari_io import local_root, write_minari
 
 __all__ = ["COLUMNS", "make_dataset", "read_log"]
 
-#: What a log holds, and the names under which it is looked for; further words of a CSV file's columns follow an underscore.
+#: Entries of a log, and their names in files; further words of a CSV file's columns follow an underscore.
 COLUMNS: dict[str, tuple[str, ...]] = {
     "observations": ("observations", "observation", "obs"),
     "actions": ("actions", "action", "act"),
@@ -45,10 +45,10 @@ def make_dataset(
 ) -> Path:
     """Write transitions, in the order in which they happened, as a Minari dataset.
 
-    Without ``next_observations``, a row's is the observation of the next row. The last row of an episode that was cut off then
+    Without ``next_observations``, a row's next observation is that of the next row. The last row of a truncated episode then
     has none: it is left out, and its observation ends the episode.
 
-    :param dataset: an id such as ``"robots/arm0-v0"``, kept where Minari keeps its own, or a :class:`~pathlib.Path`
+    :param dataset: an id such as ``"robots/arm0-v0"``, stored in Minari's own folder, or a :class:`~pathlib.Path`
     :param observations: ``(n, obs_dim)``
     :param actions: as executed, ``(n, action_dim)``
     :param rewards: ``(n,)``
@@ -80,7 +80,7 @@ def make_dataset(
     if next_observations is None:
         following = np.concatenate([columns["observations"][1:], columns["observations"][-1:]])
         keep = ended | ~cut
-        following[ended] = columns["observations"][ended]  # what comes after the end has no value
+        following[ended] = columns["observations"][ended]  # the state after the end has no value
     else:
         following, keep = _rows("next_observations", next_observations), np.ones(n, dtype=bool)
     if not all(len(array) == n for array in (*columns.values(), following)):
@@ -100,11 +100,11 @@ def make_dataset(
 
 
 def read_log(paths: Sequence[str | Path], names: Mapping[str, Sequence[str]] | None = None) -> dict[str, np.ndarray]:
-    """What :func:`make_dataset` takes from CSV or NPZ files; each file ends an episode.
+    """Read the arguments of :func:`make_dataset` from CSV or NPZ files; each file ends an episode.
 
     :param paths: CSV files with a header, or NPZ files, with the same columns
-    :param names: the columns (CSV) or the array (NPZ) of an entry of :data:`COLUMNS` where they have other names
-    :raises ValueError: for a file that cannot be read, or has not the columns
+    :param names: the columns (CSV) or the array (NPZ) of an entry of :data:`COLUMNS` with other names
+    :raises ValueError: for a file that cannot be read, or lacks the columns
     """
     parts: dict[str, list[np.ndarray]] = {}
     for path in map(Path, paths):
@@ -154,7 +154,7 @@ def _checked_actions(actions: np.ndarray, space: gym.Space) -> gym.spaces.Box:
         row = int(np.argwhere(outside.any(axis=1))[0, 0])
         raise ValueError(
             f"{int(outside.any(axis=1).sum())} actions lie outside the client's action space {space}, the first in row {row}: "
-            f"{actions[row]}; record what was executed"
+            f"{actions[row]}; record the executed actions"
         )
     return space
 

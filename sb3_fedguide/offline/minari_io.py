@@ -18,7 +18,7 @@ from minari.serialization import deserialize_space
 
 from sb3_fedguide.offline.data import OfflineData
 
-#: How far an action may lie outside its bounds, relative to them: what a conversion between float types leaves.
+#: How far an action may lie outside its bounds, relative to them: the rounding of a conversion between float types.
 ROUNDING = 1e-5
 
 __all__ = ["check_spaces", "find_dataset", "local_root", "read_minari", "write_minari"]
@@ -103,8 +103,8 @@ def _check_actions(data_path: Path, actions: np.ndarray, space: gym.Space) -> No
     if wrong.any():
         raise ValueError(
             f"the dataset at {data_path} has actions outside its own action space {space} in {wrong.sum()} of {len(actions)} "
-            f"rows, by up to {beyond.max():.3g}: clients would imitate what no environment executes. Record the actions that "
-            "were executed (clipped to the space), or leave these episodes out"
+            f"rows, by up to {beyond.max():.3g}: clients would imitate actions that no environment executes. Record the "
+            "executed actions (clipped to the space), or leave these episodes out"
         )
 
 
@@ -141,11 +141,11 @@ def _local_datasets(root: Path) -> Iterator[str]:
 
 
 def _open(data_path: Path) -> MinariStorage:
-    """A dataset that says its spaces itself.
+    """A dataset whose metadata contain its spaces.
 
-    Where it does not, Minari would make the environment that its metadata name, and these can name any function to call.
+    Without them Minari would make the environment in the metadata, which can name any function to call.
 
-    :raises ValueError: for metadata that are none, or that do not hold both spaces
+    :raises ValueError: for invalid metadata, or metadata without both spaces
     """
     try:
         metadata = MinariStorage.read_raw_metadata(data_path)

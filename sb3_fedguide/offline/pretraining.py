@@ -1,8 +1,7 @@
 """The cached offline stage of a federation: data, behaviour cloning, action prior, DICE value.
 
-Each piece is made when it is first asked for and kept in the cache under the hash of everything that it depends on. What is
-local to a client depends on that client's data and settings alone, and is cached per client; the trunk of the diffusion
-prior depends on all clients of the family.
+Each piece is made at its first use and cached under the hash of all its inputs. Pieces of one client depend only on that
+client's data and settings, and are cached per client; the trunk of the diffusion prior depends on all clients of the family.
 """
 
 from __future__ import annotations
@@ -44,14 +43,14 @@ Arrays = dict[str, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class PretrainedPrior:
-    """What :meth:`Pretraining.prior` gives, clients in the order of ``client_ids``.
+    """The result of :meth:`Pretraining.prior`, clients in the order of ``client_ids``.
 
     :param prior: the frozen common part
     :param heads: ``(N, action_dim, p + 1)``, float32
     :param moments: ``(N, p + 1, p + 1)``, float64, the moments ``S_i`` of the score cost; they stay with their client
     :param statistics: the offline data's sufficient statistics of each head
-    :param bytes_up: what each client uploaded while the trunk was trained
-    :param bytes_down: what was sent to each client
+    :param bytes_up: uploaded bytes of each client in the trunk's training
+    :param bytes_down: bytes sent to each client
     """
 
     prior: Prior
@@ -65,15 +64,15 @@ class PretrainedPrior:
 class Pretraining:
     """The offline stage of some clients of a federation.
 
-    :param family: a family's name, metadata file or object; ``None`` for environments of one's own
-    :param client_ids: the clients that live here
+    :param family: a family's name, metadata file or object; ``None`` for the user's own environments
+    :param client_ids: the clients in this process
     :param config: settings, default ``PretrainingConfig()``
     :param seed: the federation's seed
     :param cache_dir: default ``$FEDGUIDE_CACHE`` or ``~/.cache/fedguide``
     :param progress_bar: draw a bar per piece
     :param progress: called with ``(stage, done, total)`` instead
     :param env_spaces: observation and action space, checked against a given dataset; needed if ``family`` is ``None``
-    :param trunk: the diffusion prior's trunk where it was trained elsewhere, as
+    :param trunk: the diffusion prior's trunk if it was trained elsewhere, as
         :meth:`sb3_fedguide.server.trunk.TrunkAverages.payload` gives it; otherwise all clients' data are needed here
     :raises ValueError: if there is neither a family nor a dataset
     """
@@ -102,7 +101,7 @@ class Pretraining:
         self._given_trunk = trunk
 
     def check_data(self) -> None:
-        """:raises ValueError: where no offline data can be had, before anything is computed"""
+        """:raises ValueError: if no offline data can be had, before anything is computed"""
         if self.config.dataset is not None:
             return
         if self.family is None:
@@ -115,9 +114,9 @@ class Pretraining:
             check_source(self.family, client)
 
     def datasets(self, client_ids: Sequence[int] | None = None) -> list[OfflineData]:
-        """Offline data of the clients that live here, or of ``client_ids``.
+        """Offline data of the clients in this process, or of ``client_ids``.
 
-        :raises ValueError: for a dataset that does not exist or fit, or environments of one's own without one
+        :raises ValueError: for a dataset that does not exist or fit, or the user's own environments without one
         """
         wanted = self.client_ids if client_ids is None else list(client_ids)
         missing = [client for client in wanted if client not in self._data]
@@ -184,7 +183,7 @@ class Pretraining:
     def trunk(self) -> tuple[Prior, int, int]:
         """The common, frozen part of the priors, and the bytes that each client sent and received for it.
 
-        All clients of the family take part, wherever they live: otherwise a client's prior would depend on its neighbours.
+        All clients of the family take part, in any process: otherwise a client's prior would depend on its neighbours.
         """
         if self._trunk is None:
             prior = self.untrained_prior()
@@ -192,7 +191,7 @@ class Pretraining:
                 self._trunk = prior, 0, 0
             elif self._given_trunk is None:
                 self._trunk = self._diffusion(prior)
-            else:  # whoever trained it has counted the bytes
+            else:  # the process that trained it has counted the bytes
                 self._trunk = _with_trunk(prior, self._given_trunk), 0, 0
         return self._trunk
 
@@ -206,15 +205,15 @@ class Pretraining:
         return untrained_prior(self.family, self.config, observations, actions, self.seed)
 
     def trunk_settings(self) -> dict[str, Any] | None:
-        """What clients that train a trunk together have to agree on; ``None`` where the prior has none."""
+        """The settings that all clients of a trunk's training must share; ``None`` if the prior has none."""
         return self.config.settings("prior") if isinstance(self.untrained_prior(), DiffusionPrior) else None
 
     def trunk_updates(self) -> list[int]:
-        """Updates of the trunk that each client's data ask for; the longest counts."""
+        """Updates of the trunk for each client's data; the largest number counts."""
         return [self.config.n_updates("prior", len(rows)) for rows in self.datasets()]
 
     def trunk_training(self, mean: np.ndarray, std: np.ndarray, n_updates: int) -> TrunkTraining:
-        """The part of the trunk's training that the clients do who live here.
+        """The trunk's training for the clients in this process.
 
         :param mean: of all clients' observations together, ``(obs_dim,)``; ``std`` likewise
         :param n_updates: of the whole training
@@ -323,7 +322,7 @@ class Pretraining:
         return prior.requires_grad_(False), int(arrays["bytes_up"]), int(arrays["bytes_down"])
 
     def _client_key(self, index: int, piece: Piece, **more: Any) -> str:
-        """Cache key of one client's part of a piece: its own data, settings and stream, and nothing of other clients."""
+        """Cache key of one client's part of a piece: its own data, settings and stream, nothing of other clients."""
         client = self.client_ids[index]
         data = self._data[client]
         return content_key(
@@ -340,7 +339,7 @@ class Pretraining:
         """
         paths = [self.cache / "pretraining" / piece / f"{key}.npz" for key in keys]
         entries: list[Arrays | None] = [cached_arrays(path, expected=expected) for path in paths]
-        # In lockstep all train equally long, and a client's length is its own: one group per length.
+        # In lockstep all train equally long, but clients differ in their number of updates: one group per number.
         groups: dict[int, list[int]] = defaultdict(list)
         for k, client in enumerate(self.client_ids):
             if entries[k] is None:

@@ -2,7 +2,7 @@
 
 Nothing but observation moments (once) and trunk parameters (every ``average_every`` updates) leaves a client.
 :func:`federated_trunk` runs all clients in one process; a deployment runs the same :class:`TrunkTraining` on each site with
-the clients that live there, exchanges what ``uploads()`` and ``receive()`` carry, and gets the same trunk.
+its clients, exchanges the payloads of ``uploads()`` and ``receive()``, and gets the same trunk.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Upload = dict[str, np.ndarray]
 
 
 class ActionData(Protocol):
-    """What the trunk needs of a client's dataset: ``observations (n, obs_dim)`` and ``actions (n, action_dim)``."""
+    """The part of a client's dataset that the trunk needs: ``observations (n, obs_dim)`` and ``actions (n, action_dim)``."""
 
     @property
     def observations(self) -> np.ndarray: ...
@@ -53,12 +53,12 @@ class ActionData(Protocol):
 
 @dataclass(frozen=True)
 class TrunkResult:
-    """A pretrained trunk and what it took.
+    """A pretrained trunk, with losses and bytes.
 
     :param prior: with the averaged, frozen trunk and the merged observation moments
     :param losses: mean velocity loss of each client between two averages, ``(n_averages, n_clients)``
-    :param upload_bytes: what each client sent (moments and trunks), as float32
-    :param download_bytes: what each client received
+    :param upload_bytes: bytes that each client sent (moments and trunks), as float32
+    :param download_bytes: bytes that each client received
     """
 
     prior: DiffusionPrior
@@ -68,7 +68,7 @@ class TrunkResult:
 
 
 def observation_moments(observations: np.ndarray) -> Upload:
-    """What a client tells of its observations: ``n_samples`` and, per coordinate, ``mean`` and ``var`` (population)."""
+    """The moments of a client's observations: ``n_samples`` and, per coordinate, ``mean`` and ``var`` (population)."""
     observations = np.asarray(observations, dtype=np.float64)
     return {
         "n_samples": np.array(len(observations), dtype=np.float64),
@@ -87,7 +87,7 @@ class TrunkTraining:
 
     :param prior: the network to start from, with the federation's observation moments; not changed
     :param datasets: one per client
-    :param rngs: one generator per client; all that is random about client k's updates comes from its own
+    :param rngs: one generator per client, the only source of randomness in its updates
     :param n_updates: length of the cosine schedule
     :param batch_size: rows per client and update
     :param learning_rate: of Adam at the start; it falls to zero

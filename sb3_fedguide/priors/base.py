@@ -1,4 +1,4 @@
-"""What every action prior has in common: features, a linear head, and the distance between two heads.
+"""The base class of action priors: features, a linear head, and the distance between two heads.
 
 A prior's (scaled) score is linear in its head, ``head @ [features; 1]``. So averaging heads averages scores, and the squared
 distance between two clients' scores is a quadratic form in the difference of their heads.
@@ -47,7 +47,7 @@ class HeadStatistics:
 
 
 class Prior(nn.Module, ABC):
-    """A density over actions given an observation, with a linear head (a client's whole contribution).
+    """A density over actions given an observation, with a linear head (the only part that a client uploads).
 
     Randomness always comes from the ``numpy.random.Generator`` that is passed in. Nothing here needs gradients.
 
@@ -97,13 +97,13 @@ class Prior(nn.Module, ABC):
 
     @abstractmethod
     def feature_moment(self, obs: np.ndarray, actions: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """``S = E[f f^T]`` of the score cost, with whatever turns the head's output into a score: see :func:`score_cost`.
+        """``S = E[f f^T]`` of the score cost, with the factor from the head's output to a score: see :func:`score_cost`.
 
         :return: float64, ``(p + 1, p + 1)``. It never leaves the client.
         """
 
     def describes_density(self, heads: np.ndarray | th.Tensor) -> np.ndarray:
-        """Which of some heads ``(n, action_dim, p + 1)`` are those of a density, ``(n,)`` bool."""
+        """Whether each of the heads ``(n, action_dim, p + 1)`` gives a density, ``(n,)`` bool."""
         return np.ones(len(heads), dtype=bool)
 
     @abstractmethod
@@ -231,5 +231,5 @@ def score_cost(head: np.ndarray, experts: np.ndarray, moment: np.ndarray) -> np.
             f"got {head.shape}, {experts.shape} and {moment.shape}."
         )
     difference = experts - head
-    # A moment is positive semi-definite: what is below zero is rounding.
+    # A moment is positive semi-definite: values below zero are rounding errors.
     return np.maximum(np.einsum("mdp,pq,mdq->m", difference, moment, difference, optimize=True), 0.0)

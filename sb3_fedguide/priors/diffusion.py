@@ -13,7 +13,7 @@ from sb3_fedguide.priors.density import flow_sample, ode_log_density, training_a
 from sb3_fedguide.priors.trunk_network import DiffusionTrunk
 from sb3_fedguide.settings.pretraining import DEFAULTS
 
-OBS_CLIP = 10.0  # standardised observations beyond this are as far out as it gets
+OBS_CLIP = 10.0  # bound on standardised observations
 CHUNK_ROWS = 1024  # keeps the activations of one pass in the processor's cache
 
 
@@ -21,9 +21,10 @@ class DiffusionPrior(Prior):
     """State-conditioned diffusion over single actions: K = 1000 steps, linear beta from 1e-4 to 2e-2, noise prediction.
 
     ``eps_hat = sigma a_k + alpha W [phi; 1]``: the head predicts the velocity ``(eps - sigma a_k) / alpha``. The score
-    ``-eps_hat / sigma`` is affine in ``W`` and its constant part is everyone's, so averaging heads with weights that sum to
-    one is averaging scores, and two scores differ by ``-alpha / sigma (W - W') [phi; 1]``. For ``W = 0`` the prior is the
-    standard normal, towards which the ridge shrinks; and at ``t = 1`` the flow ends in the standard normal whatever ``W``.
+    ``-eps_hat / sigma`` is affine in ``W`` with the same constant part for all clients. So averaging heads with weights that
+    sum to one equals averaging scores, and two scores differ by ``-alpha / sigma (W - W') [phi; 1]``.
+    For ``W = 0`` the prior is the standard normal, towards which the ridge shrinks; at ``t = 1`` the flow ends in the
+    standard normal for any ``W``.
 
     :param obs_dim: length of an observation
     :param action_dim: length of an action; actions are expected on the scale of [-1, 1]
@@ -100,7 +101,7 @@ class DiffusionPrior(Prior):
         self.obs_std.copy_(th.from_numpy(np.where(std > 1e-6, std, 1.0)))
 
     def standardise(self, obs: th.Tensor) -> th.Tensor:
-        """Raw observations to what the trunk sees."""
+        """The trunk's inputs for raw observations."""
         return ((obs - self.obs_mean) / self.obs_std).clamp(-OBS_CLIP, OBS_CLIP)
 
     @th.no_grad()

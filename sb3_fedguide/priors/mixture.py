@@ -60,7 +60,7 @@ def active_experts(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Indices of the experts that a row uses, and their renormalised weights (float64).
 
-    :param usable: ``(n_experts,)`` bool, which experts are densities at all: the server cannot tell, and a client that lies
+    :param usable: ``(n_experts,)`` bool, which experts are densities: the server cannot check this, and a malicious client
         may have made one that is not; all if ``None``
     :raises ValueError: see :func:`mixture_log_prob`
     """

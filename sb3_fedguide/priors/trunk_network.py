@@ -18,10 +18,10 @@ class DiffusionTrunk(nn.Module):
     ``[shift, gate_0, ..., gate_n] = encoder(s) + level(k)``, ``h_0 = W a_k + shift``,
     ``h_{j+1} = h_j + W_j ((1 + gate_j) silu(h_j))``, ``phi = (1 + gate_n) silu(h_n)``.
 
-    The observation and the noise level meet in products because the velocity of a sharp prior does: a gain that depends on
-    ``k`` times a distance from a mean that depends on ``s``. The encoder is evaluated once per observation, not once per
-    integration step, so its width is almost free. There are no normalisation layers, so that the derivative with respect to
-    the action is a few exact lines (:meth:`with_tangents`).
+    The observation and the noise level are multiplied, because the velocity of a sharp prior is a product: a gain that
+    depends on ``k`` times a distance from a mean that depends on ``s``. The encoder is evaluated once per observation, not
+    once per integration step, so its width is almost free. There are no normalisation layers, so that the derivative with
+    respect to the action is a few exact lines (:meth:`with_tangents`).
 
     :param obs_dim: length of a (standardised) observation
     :param action_dim: length of an action

@@ -1,4 +1,4 @@
-"""Federated averaging of parameters (McMahan et al. 2017), and how far the server goes towards the average."""
+"""Federated averaging of parameters (McMahan et al. 2017), and the server's step towards the average."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def combine(
     aggregator: Aggregator,
     trim_fraction: float,
 ) -> Payload:
-    """The arrays ``names`` of all clients in one: their :func:`weighted_average`, or coordinate by coordinate their median or
-    the mean of what is left without the ``floor(trim_fraction * n)`` lowest and as many of the highest (Yin et al. 2018).
+    """Combine the arrays ``names`` of all clients: by :func:`weighted_average`, or coordinate by coordinate by median or by
+    the mean without the ``floor(trim_fraction * n)`` lowest and as many highest values (Yin et al. 2018).
 
     Median and trimmed mean count every client once, whatever number of samples it claims.
     """
@@ -60,7 +60,7 @@ def fedexp_step(latest: Payload, uploads: Mapping[int, Payload], change: Payload
 
     :param latest: theta, from which ``Delta_i = theta_i - theta``
     :param uploads: theta_i by client, with the samples whose share is ``w_i`` (``1 / N`` in the paper)
-    :param change: Delta, what takes the place of the average of the ``Delta_i``
+    :param change: Delta, the average of the ``Delta_i``, or what ``aggregator`` takes instead
     """
     counts = {client: float(payload[N_SAMPLES]) for client, payload in uploads.items()}
     total = sum(counts.values())
@@ -83,12 +83,12 @@ def averaging_is_due(round: int, every: int, until: int | None = None) -> bool:
 
 
 def policy_is_due(round: int, average: str, every: int, until: int | None = None) -> bool:
-    """Whether what is averaged after round ``round`` are policies, not critics alone."""
+    """Whether policies, and not only critics, are averaged after round ``round``."""
     return average != "critic" and averaging_is_due(round, every, until)
 
 
 def averaged_prefixes(average: Average, actor: tuple[str, ...], critic: tuple[str, ...]) -> tuple[str, ...]:
-    """How the names of the parameters begin that are averaged.
+    """The prefixes of the names of the averaged parameters.
 
     :param average: which of them
     """
@@ -98,18 +98,18 @@ def averaged_prefixes(average: Average, actor: tuple[str, ...], critic: tuple[st
 class Averaging(Strategy):
     """Averages every uploaded array whose name begins with one of ``prefixes`` and sends the average to all.
 
-    What it sends is ``theta + server_step * v`` with ``v = server_momentum * v + (average - theta)``, where theta is what it
-    sent last (FedOpt's SGD, Reddi et al. 2021). A step of 1 without momentum is the average itself.
+    It sends ``theta + server_step * v`` with ``v = server_momentum * v + (average - theta)``, where theta is its last
+    broadcast (FedOpt's SGD, Reddi et al. 2021). A step of 1 without momentum is the average itself.
 
-    Between the rounds in which it averages it sends nothing, and clients go on with their own parameters. An upload with zero
-    samples is of a client that tests the average and has not taken it: it counts for nothing.
+    In rounds without averaging it sends nothing, and clients continue with their own parameters. An upload with zero samples
+    comes from a client that has left the average after a test: it has no weight.
 
     :param prefixes: what to average; everything by default
     :param average_every: after rounds ``average_every``, ``2 * average_every``, ...
-    :param average_until: not after later rounds than this; ``None`` for no end
-    :param aggregator: what takes the place of the average, see :func:`combine`
-    :param trim_fraction: what ``"trimmed_mean"`` leaves out on either side
-    :param server_step: how far to go along the mean update: a number, or ``"exp"`` for :func:`fedexp_step`
+    :param average_until: last round with averaging; ``None`` for no end
+    :param aggregator: how uploads are combined, see :func:`combine`
+    :param trim_fraction: share of the clients that ``"trimmed_mean"`` leaves out on either side
+    :param server_step: step size along the mean update: a number, or ``"exp"`` for :func:`fedexp_step`
     :param server_momentum: share of the last update that is added to this one
     :raises ValueError: for values out of range
     """

@@ -1,7 +1,7 @@
-"""Simulated time: how long a client's round takes, who drops out, and how the server deals with it. Needs only NumPy.
+"""Simulated time: the duration of clients' rounds, dropouts, and the server's policy. Needs only NumPy.
 
 In lockstep a client trains at the start of its round, in no time; its upload counts when the simulated time of the round is
-over. Until then it is busy: it keeps all of its state, and its upload with it.
+over. Until then it is busy: it keeps its whole state, and the upload.
 """
 
 from __future__ import annotations
@@ -21,27 +21,28 @@ from sb3_fedguide.server.rounds import participants
 WaitingPolicy = Literal["sync", "deadline", "async"]
 POLICIES: tuple[WaitingPolicy, ...] = get_args(WaitingPolicy)
 
-#: What each policy has of its own, and in how many medians it is by default.
+#: The setting that each policy has in addition, and its default in medians.
 _OWN = {"deadline": ("deadline", 2.0), "async": ("tick", 1.0)}
 _DROPOUT_MEDIANS = 2.0
 
 
 @dataclass(frozen=True)
 class DelaySettings:
-    """How long clients take, and what the server waits for. Seconds are simulated.
+    """The duration of clients' rounds, and what the server waits for. Seconds are simulated.
 
     A round of client ``i`` takes ``median * exp(spread * z_i + jitter * z)`` seconds, with one standard normal ``z_i`` for
     each client and a ``z`` for each of its rounds.
 
-    :param policy: ``"sync"`` waits until every upload has come or is known not to come. ``"deadline"`` waits no longer than
-        ``deadline``; what comes later is lost, and its client begins no other round before it has finished this one.
-        ``"async"`` aggregates after every ``tick`` what has come by then; a client then begins again at once, from what
-        the server has just sent, and the others go on.
+    :param policy: ``"sync"`` waits until every upload has arrived or is known to be lost. ``"deadline"`` waits at most
+        ``deadline``; a later upload is lost, and its client begins no other round before it has finished this one.
+        ``"async"`` aggregates after every ``tick`` the uploads that have arrived; their clients begin again at once, from
+        the new broadcast, and the others continue.
     :param median: seconds of a round of the median client
     :param spread: standard deviation of the logarithm of the clients' speeds
-    :param jitter: that of one client's rounds
+    :param jitter: standard deviation of the logarithm of one client's round times
     :param dropout: probability that a round's upload is lost
-    :param timeout: seconds after which the server knows that, and the client begins anew; twice the median by default
+    :param timeout: seconds after which the server knows of a lost upload, and the client begins a new round; twice the median
+        by default
     :param deadline: twice the median by default; may be infinite. Only with ``"deadline"``
     :param tick: the median by default. Only with ``"async"``
     :raises ValueError: for values out of range, or of another policy
@@ -58,7 +59,7 @@ class DelaySettings:
 
     def __post_init__(self) -> None:
         if self.policy not in POLICIES:
-            raise ValueError(f"what the server waits for is {' or '.join(POLICIES)}, not {self.policy!r}")
+            raise ValueError(f"policy must be {' or '.join(POLICIES)}, not {self.policy!r}")
         for name, value in list(asdict(self).items())[1:]:
             if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value)):
                 raise ValueError(f"{name}={value!r} is not a number")
@@ -66,12 +67,14 @@ class DelaySettings:
             raise ValueError(f"median={self.median} must lie in (0, 1e9]: it is the seconds of a client's round")
         for name in ("spread", "jitter"):
             if not 0 <= getattr(self, name) <= 5:
-                raise ValueError(f"{name}={getattr(self, name)} must lie in [0, 5]: it is the deviation of a logarithm")
+                raise ValueError(
+                    f"{name}={getattr(self, name)} must lie in [0, 5]: it is the standard deviation of a logarithm"
+                )
         if not 0 <= self.dropout < 1:
             raise ValueError(f"dropout={self.dropout} must lie in [0, 1): it is the share of uploads that are lost")
         self._default("timeout", _DROPOUT_MEDIANS)
         if not 0 < self.timeout < math.inf:  # type: ignore[operator]
-            raise ValueError(f"timeout={self.timeout} must be positive and finite: nobody waits for ever for who dropped out")
+            raise ValueError(f"timeout={self.timeout} must be positive and finite: it ends the wait for a lost upload")
         for policy, (name, medians) in _OWN.items():
             if policy == self.policy:
                 self._default(name, medians)
@@ -90,13 +93,13 @@ class DelaySettings:
             object.__setattr__(self, name, medians * self.median)
 
     def __str__(self) -> str:
-        """What :func:`parse_delays` reads as the same settings."""
+        """The text from which :func:`parse_delays` reads the same settings."""
         values = {name: value for name, value in asdict(self).items() if name != "policy" and value is not None}
         return f"{self.policy}:" + ",".join(f"{name}={float(value)!r}" for name, value in values.items())
 
 
 def delay_settings(values: Mapping[str, Any]) -> DelaySettings:
-    """Settings by name, such as a configuration file has.
+    """Settings by name, as in a configuration file.
 
     :raises ValueError: for an unknown or missing name, or a wrong value
     """
@@ -105,14 +108,14 @@ def delay_settings(values: Mapping[str, Any]) -> DelaySettings:
         if name not in known:
             raise ValueError(f"delays have no {name!r}; they have {', '.join(known)}")
     if "policy" not in values:
-        raise ValueError(f"what the server waits for is missing: policy is {' or '.join(POLICIES)}")
+        raise ValueError(f"policy is missing: it is {' or '.join(POLICIES)}")
     return DelaySettings(**values)
 
 
 def parse_delays(text: str) -> DelaySettings:
     """Settings as one word: ``sync``, or ``async:median=60,spread=0.8,dropout=0.1,tick=30``.
 
-    :raises ValueError: for what is none
+    :raises ValueError: for a text that gives no settings
     """
     policy, _, rest = text.partition(":")
     values: dict[str, Any] = {"policy": policy}
@@ -128,10 +131,10 @@ def parse_delays(text: str) -> DelaySettings:
 
 
 class Delays:
-    """The clock of a simulated federation, and who is busy until when.
+    """The clock of a simulated federation, and until when each client is busy.
 
-    A round is :meth:`begin` and then :meth:`end`. The seconds of a client's k-th round depend on the seed, the client and k
-    alone: they are the same under every policy, and whoever else there is.
+    A round is :meth:`begin` and then :meth:`end`. The seconds of a client's k-th round depend only on the seed, the client
+    and k: they are the same under every policy, and with any other clients.
 
     :param seed: of the federation
     :param clients: ids, in the order of all masks
@@ -166,7 +169,7 @@ class Delays:
 
     @property
     def idle(self) -> np.ndarray:
-        """Who could begin a round now, ``(n_clients,)`` bool; never nobody."""
+        """The clients that could begin a round now, ``(n_clients,)`` bool; always at least one."""
         return self.idle_at <= self.seconds
 
     def draw(self, index: int) -> tuple[float, bool]:
@@ -178,11 +181,11 @@ class Delays:
         return settings.median * math.exp(deviation), bool(rng.random() < settings.dropout)
 
     def begin(self, round: int, client_fraction: float = 1.0, extra: np.ndarray | None = None) -> np.ndarray:
-        """Let a share of those begin that are idle.
+        """Let a share of the idle clients begin a round.
 
-        :param round: complete rounds, for the draw of who takes part
-        :param extra: work of each client beside its round's, as a share of it, ``(n_clients,)``; none by default
-        :return: who begins, ``(n_clients,)`` bool
+        :param round: complete rounds, for the draw of the participants
+        :param extra: each client's additional work, as a share of its round's, ``(n_clients,)``; none by default
+        :return: the clients that begin, ``(n_clients,)`` bool
         """
         present = np.zeros(len(self.clients), dtype=bool)
         present[participants(np.flatnonzero(self.idle).tolist(), self.seed, round, client_fraction)] = True
@@ -199,7 +202,7 @@ class Delays:
     def end(self) -> np.ndarray:
         """Let the time of the server's round pass.
 
-        :return: whose uploads have arrived and are to be aggregated, ``(n_clients,)`` bool
+        :return: the clients whose uploads have arrived and are aggregated, ``(n_clients,)`` bool
         """
         if self.settings.policy == "async":
             self._tick()
@@ -209,7 +212,7 @@ class Delays:
             self.seconds = min(self.seconds + deadline, latest)
         arrived = self.training & ~self.lost & self.idle
         if self.settings.policy != "async":
-            self.lost |= self.training & ~arrived  # nobody waits for them any more
+            self.lost |= self.training & ~arrived  # the server no longer waits for them
             self.seconds = max(self.seconds, float(self.idle_at.min()))  # until somebody can begin the next round
         self.finished = self.training & self.idle
         self.training &= ~self.finished
@@ -229,17 +232,17 @@ class Delays:
             self.seconds += tick
 
     def save_state(self) -> State:
-        """Plain data for a checkpoint; uploads that are on their way are part of their clients' own state."""
+        """Plain data for a checkpoint; uploads that have not arrived are part of their clients' own state."""
         own = {name: value for name, value in vars(self).items() if name not in ("settings", "clients")}
         return {"settings": str(self.settings), **freeze(own)}
 
     def load_state(self, state: State) -> None:
-        """Go on from what :meth:`save_state` returned.
+        """Restore what :meth:`save_state` returned.
 
         :raises ValueError: for the state of a run with other delays
         """
         if state["settings"] != str(self.settings):
-            raise ValueError(f"the run has the delays {state['settings']}, and not {self.settings}; give it its own")
+            raise ValueError(f"the run has the delays {state['settings']}, not {self.settings}; resume it with its own")
         for name, value in state.items():
             if name != "settings":
                 setattr(self, name, thaw(value))

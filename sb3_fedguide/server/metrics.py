@@ -1,4 +1,4 @@
-"""What clients report of a round: their logs as one log, and their evaluations as one table."""
+"""The clients' reports of a round: their logs as one log, and their evaluations as one table."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ClientEvaluation:
     """One client's episodes with one policy.
 
     :param policy: ``"deployed"``, after local training, or ``"broadcast"``, what the server sent after it
-    :param successes: whether each episode succeeded; ``None`` where the environment does not say
+    :param successes: whether each episode succeeded; ``None`` if the environment does not say
     """
 
     client: int
@@ -57,7 +57,7 @@ def evaluation_row(
 
     :param timesteps: environment steps of all clients together
     :param returns: of the client's episodes, ``(n_episodes,)``, like ``lengths``
-    :param success_rate: ``None`` where the environment does not say
+    :param success_rate: ``None`` if the environment does not say
     """
     rate = "" if success_rate is None else f"{success_rate:.6g}"
     mean, std, length = np.mean(returns), np.std(returns), np.mean(lengths)
@@ -89,10 +89,10 @@ def read_evaluations(client: int, facts: Mapping[str, Any]) -> list[ClientEvalua
 
 
 def count_tests(facts: Mapping[int, Mapping[str, Any]], counted: dict[int, int]) -> int:
-    """The environment steps of tests that clients report and that are not in ``counted``, where they are now.
+    """The number of reported test steps that were not in ``counted``; adds them to it.
 
-    :param facts: each client's, with its ``test_steps`` since the beginning; what is no number of steps counts for nothing
-    :param counted: steps of tests by client
+    :param facts: each client's report, with its ``test_steps`` since the start; invalid numbers are ignored
+    :param counted: test steps by client
     """
     new = 0
     for client, own in facts.items():
@@ -104,10 +104,10 @@ def count_tests(facts: Mapping[int, Mapping[str, Any]], counted: dict[int, int])
 
 
 def merge_metrics(facts: Mapping[int, Mapping[str, Any]]) -> dict[str, float]:
-    """One log of all clients': ``client_<k>/...`` is taken from client k, everything else averaged over those that say it,
-    but for :data:`~sb3_fedguide.server.payload.EPSILON`, the largest.
+    """All clients' logs as one: ``client_<k>/...`` is taken from client k, every other key is averaged over the clients that
+    report it. Of :data:`~sb3_fedguide.server.payload.EPSILON` the largest value is taken.
 
-    Keys of evaluations are left out: :func:`evaluation_metrics` makes them of the episodes.
+    Keys of evaluations are left out: :func:`evaluation_metrics` computes them from the episodes.
     """
     merged: dict[str, float] = {}
     shared: dict[str, list[float]] = {}

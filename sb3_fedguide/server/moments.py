@@ -48,12 +48,12 @@ class ObservationMoments(Strategy):
     """Pools the clients' observation statistics: ``normalize="shared"``.
 
     A client uploads count, mean and variance of its last round's raw observations, and receives those of all observations
-    that all clients have uploaded since the beginning. With the mean as aggregator they are exact, but for
-    :data:`START_COUNT`, and do not depend on the order in which uploads come. Before the first round one exchange pools what
-    the clients know from their offline data.
+    that all clients have uploaded since the beginning. With the mean as aggregator they are exact, except for
+    :data:`START_COUNT`, and do not depend on the order of the uploads. Before the first round one exchange pools the
+    statistics of the clients' offline data.
 
-    :param aggregator: what takes the place of the pooled mean and variance of a round: by coordinate the median or trimmed
-        mean of the clients' means, and of their mean squared distances from it
+    :param aggregator: how the mean and variance of a round are pooled: ``"mean"``, or coordinate by coordinate the median or
+        trimmed mean of the clients' means, and of their mean squared distances from it
     :param trim_fraction: see :func:`~sb3_fedguide.server.averaging.combine`
     """
 

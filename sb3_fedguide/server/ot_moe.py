@@ -19,11 +19,11 @@ COST_ROW = "prior.cost_row"
 EXPERTS = "prior.experts"
 MIXTURE_ROW = "prior.mixture_row"
 
-# POT looks at the marginals in its first and every tenth iteration after it.
+# POT checks the marginals in its first and every tenth iteration after it.
 _ITERATIONS, _MAX_RUNS = 11, 900
 _DAMPING = 0.01
 
-#: A head looks wrong whose agreement with the others' is lower than the clients' median by more than this. Honest heads were
+#: A head looks wrong if its agreement with the others is lower than the clients' median by more than this. Honest heads were
 #: at most 0.35 below it; random and negated ones at least 0.5 from the first round on, and mostly before (docs/robustness.md).
 LEAST_AGREEMENT = 0.5
 
@@ -53,16 +53,16 @@ def sinkhorn_plan(
 ) -> TransportPlan:
     """Entropic optimal transport plan (paper, Eq. 8) by POT's log-domain Sinkhorn.
 
-    Near a permutation the iterations converge like ``1 / k``: thousands of them. So POT iterates in short runs, each of which
-    starts from the last one's potentials after a Newton step (:func:`_newton_step`) that the iterations would creep along.
-    What is returned comes from POT, and its marginals are checked here.
+    Near a permutation the iterations converge like ``1 / k``: thousands of them. So POT iterates in short runs. Each run
+    starts from the last one's potentials after a Newton step (:func:`_newton_step`), which replaces many iterations. The
+    returned plan comes from POT, and its marginals are checked here.
 
     :param cost: ``(n_clients, n_experts)``, finite, nonnegative, already scaled
     :param eta: entropic regularisation
     :param row_marginal: mu, uniform by default; ``column_marginal``, nu, alike
     :param start: potentials of a similar problem, from which few iterations are left
     :raises ValueError: for costs that are not finite
-    :raises RuntimeError: where the marginal error stays above ``1e-4 / n_clients``
+    :raises RuntimeError: if the marginal error stays above ``1e-4 / n_clients``
     """
     import ot
 
@@ -100,11 +100,11 @@ def sinkhorn_plan(
 def _newton_step(
     scaled_cost: np.ndarray, mu: np.ndarray, nu: np.ndarray, mass: np.ndarray, potentials: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Potentials after a step on the dual of the columns, whose rows are exact; as they were where it does not help.
+    """Potentials after a Newton step on the dual of the columns, with exact rows; unchanged if the step does not help.
 
-    With the row potentials eliminated, the dual is concave in the M column potentials, its gradient is what the columns lack
-    and its Hessian ``-(diag(q) - P^T diag(1 / mu) P)`` with ``q = P^T 1``. The damping vanishes with the error, so that the
-    step converges quadratically, and it keeps a step finite where the plan is a permutation and the Hessian vanishes.
+    With the row potentials eliminated, the dual is concave in the M column potentials. Its gradient is the columns' marginal
+    error, its Hessian is ``-(diag(q) - P^T diag(1 / mu) P)`` with ``q = P^T 1``. The damping vanishes with the error, so that
+    the step converges quadratically, and it keeps a step finite where the plan is a permutation and the Hessian vanishes.
 
     :param scaled_cost: the costs over eta
     :param mass: the plan of ``potentials``, whose rows sum to ``mu``
@@ -149,13 +149,13 @@ def head_oddity(heads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def given_heads(plan: np.ndarray) -> np.ndarray:
-    """What each client's mixture holds of every client's head: who listens to whom.
+    """The share of every client's head in each client's mixture.
 
     Client j's mixture weighs expert m with ``P_jm / sum_m P_jm``, and that expert weighs client i's head with
     ``P_im / sum_i P_im`` (paper, Eq. 9 and 10).
 
     :param plan: ``(n_clients, n_experts)``
-    :return: of head i in client j's mixture at [j, i], ``(n_clients, n_clients)``; rows sum to one
+    :return: the share of head i in client j's mixture at [j, i], ``(n_clients, n_clients)``; rows sum to one
     """
     rows = plan / plan.sum(axis=1, keepdims=True)
     columns = plan / np.maximum(plan.sum(axis=0), np.finfo(float).tiny)
@@ -163,7 +163,7 @@ def given_heads(plan: np.ndarray) -> np.ndarray:
 
 
 def head_shares(plan: np.ndarray) -> np.ndarray:
-    """What the other clients' mixtures hold of each client's head, on average: ``1 / n_clients`` where all share alike.
+    """The mean share of each client's head in the other clients' mixtures: ``1 / n_clients`` if all share equally.
 
     :param plan: ``(n_clients, n_experts)``, see :func:`given_heads`
     :return: ``(n_clients,)``
@@ -205,17 +205,17 @@ def farthest_points(heads: np.ndarray, n_experts: int, rng: np.random.Generator)
 class OTMoE(Strategy):
     """Keeps M expert heads and routes clients to them by an entropic transport plan.
 
-    Before the first round it takes two exchanges: heads come up and the first experts go down, then the clients' cost
-    rows come up and the first mixture rows go down. After every round the experts become column-weighted averages of the
+    Before the first round it needs two exchanges: clients upload heads and receive the first experts, then they upload cost
+    rows and receive the first mixture rows. After every round the experts become column-weighted averages of the
     clients' heads (paper, Eq. 9) and client i's mixture weights its normalised row (Eq. 10).
     A client that is absent keeps its row.
 
     :param n_experts: M
     :param eta: entropic regularisation of the scaled costs
-    :param cost: ``"score"``, rows of expected squared score distances that clients compute at home (Eq. 7), or
-        ``"param"``, squared distances between heads that the server computes
-    :param cost_scaling: divide costs by their ``"max"`` or by the ``"median"`` of the positive ones, which one outlier
-        cannot flatten
+    :param cost: ``"score"``, rows of expected squared score distances, computed at the client (Eq. 7), or ``"param"``,
+        squared distances between heads, computed at the server
+    :param cost_scaling: divide costs by their ``"max"`` or by the ``"median"`` of the positive ones, which is robust to
+        one outlier
     :param seed: of the server's own stream, used for jitter where M > N
     """
 
@@ -271,12 +271,12 @@ class OTMoE(Strategy):
     def latest(self, client: int) -> Payload:
         if self.experts is None:
             return {}
-        # Who is new to the server knows nothing of the experts yet.
+        # A client that is new to the server has no experts yet.
         row = self.rows.get(client, np.full(self.n_experts, 1 / self.n_experts, dtype=np.float32))
         return {EXPERTS: self.experts.copy(), MIXTURE_ROW: row}
 
     def _broadcast_experts(self) -> np.ndarray:
-        """The experts as they are now, once for all clients: nobody may write into what the others get too."""
+        """The current experts, one read-only array for all clients."""
         assert self.experts is not None
         experts = self.experts.copy()
         experts.flags.writeable = False
@@ -298,7 +298,7 @@ class OTMoE(Strategy):
         self.experts = np.where(served.reshape(-1, *([1] * (heads.ndim - 1))), updated, self.experts)
 
     def _look_at_heads(self, clients: list[int], heads: np.ndarray) -> None:
-        """How odd each client's head is, and how much of it the others are given: what the check of norms does not see."""
+        """Warn of heads unlike the others, with their share in the other mixtures; the check of norms does not find them."""
         assert self.plan is not None
         if len(clients) < FEWEST_NORMS:
             return

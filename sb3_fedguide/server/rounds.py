@@ -13,20 +13,20 @@ from sb3_fedguide.settings.participants import n_participants
 
 
 class Coordinator:
-    """Knows who has missed an exchange, counts bytes, and calls the strategy.
+    """Knows which clients have missed an exchange, counts bytes, and calls the strategy.
 
-    :param strategy: the method's; ``None`` where nothing is exchanged
+    :param strategy: the method's; ``None`` for a method without exchange
     """
 
     def __init__(self, strategy: Strategy | None) -> None:
         self.strategy = strategy
-        #: clients that have missed what others received, and have to catch up before they train again
+        #: clients that have missed a broadcast, and have to catch up before they train again
         self.outdated: set[int] = set()
-        #: bytes that all clients together have sent and received, and what of them was before the first round
+        #: bytes that all clients together have sent and received, and the part of them before the first round
         self.bytes_up = self.bytes_down = 0
         self.offline_bytes_up = self.offline_bytes_down = 0
-        #: what is to be said of the last exchange: which uploads it rejected, and once of each client, which it used although
-        #: they look wrong
+        #: warnings of the last exchange: rejected uploads, and, once for each client, uploads that were used although they
+        #: look wrong
         self.complaints: list[str] = []
         self._doubted: set[int] = set()
         #: figures of the last exchange, by log key
@@ -43,7 +43,7 @@ class Coordinator:
         return {} if self.strategy is None else self.strategy.rejected
 
     def catch_up(self, client: int) -> Payload:
-        """What a client receives before it trains again that is :attr:`outdated`, which it then is no longer."""
+        """The payload that an :attr:`outdated` client receives before it trains again; it is then up to date."""
         self.outdated.discard(client)
         payload = {} if self.strategy is None else self.strategy.catch_up(client)
         self.bytes_down += payload_bytes({client: payload})
@@ -54,14 +54,14 @@ class Coordinator:
 
         :param round: 0 before the first round, h after the h-th
         :param uploads: payload by client id
-        :param absent: everybody else who belongs to the federation
+        :param absent: all other clients of the federation
         :return: broadcast by client id, for those that receive one
         """
         assert self.strategy is not None
-        missed = self.outdated & uploads.keys()  # they were busy with their uploads while others received something
+        missed = self.outdated & uploads.keys()  # they were busy while others received a broadcast
         broadcasts = self.strategy.exchange(round, uploads)
         self.outdated -= {k for k in missed if k in broadcasts and broadcasts[k].keys() >= self.strategy.latest(k).keys()}
-        if any(broadcasts.values()):  # what the others received is what the absent and the rejected have missed
+        if any(broadcasts.values()):  # the absent and the rejected have missed this broadcast
             self.outdated |= {*absent, *self.strategy.rejected}
         doubts = {client: why for client, why in self.strategy.doubts.items() if client not in self._doubted}
         self._doubted |= doubts.keys()
@@ -79,7 +79,7 @@ class Coordinator:
         return broadcasts
 
     def count(self, up: int, down: int, offline: bool) -> None:
-        """Add to the bytes; ``offline`` where they come once, before the first round."""
+        """Add to the bytes; ``offline`` for those that are sent once, before the first round."""
         self.bytes_up += up
         self.bytes_down += down
         if offline:
@@ -88,7 +88,7 @@ class Coordinator:
 
     @property
     def bytes_counted(self) -> list[int]:
-        """All that was counted, for a checkpoint; those of earlier versions do not tell what was offline."""
+        """All counts, for a checkpoint; checkpoints of earlier versions have no offline bytes."""
         return [self.bytes_up, self.bytes_down, self.offline_bytes_up, self.offline_bytes_down]
 
     @bytes_counted.setter
@@ -97,12 +97,12 @@ class Coordinator:
 
 
 def rejections(what: str, reasons: Mapping[int, str]) -> list[str]:
-    """A sentence for each client of whose ``what`` the server makes no use."""
+    """A sentence for each client whose ``what`` the server does not use."""
     return [f"the server rejects the {what} of client {client}: {reason}" for client, reason in reasons.items()]
 
 
 def participants(clients: Sequence[int], seed: int, round: int, client_fraction: float) -> list[int]:
-    """Who of those that are there takes part in a round.
+    """The participants of a round among the clients that are present.
 
     :param clients: ids in ascending order
     :param round: counted from 0
@@ -115,6 +115,6 @@ def participants(clients: Sequence[int], seed: int, round: int, client_fraction:
 
 
 def payload_bytes(payloads: Mapping[int, Payload]) -> int:
-    """Size of all arrays of all clients' payloads, in bytes; what is no array, as in a wrong upload, has none."""
+    """Size of all arrays of all clients' payloads, in bytes; values that are no arrays, as in a wrong upload, count 0."""
     arrays = [array for payload in payloads.values() if isinstance(payload, Mapping) for array in payload.values()]
     return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray | np.generic))

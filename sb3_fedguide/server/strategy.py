@@ -33,7 +33,7 @@ class Strategy(ABC):
         self.upload_bound: float | None = UPLOAD_BOUND
         #: clients whose uploads the last exchange rejected, and why
         self.rejected: dict[int, str] = {}
-        #: what each client was last sent of the parameters that it uploads: what its next upload is compared with
+        #: the last broadcast to each client, of the parameters that it uploads; its next upload is compared with it
         self.sent: dict[int, Payload] = {}
         #: names of these parameters
         self.compared: list[str] = []
@@ -45,20 +45,20 @@ class Strategy(ABC):
 
     @property
     def norm_groups(self) -> tuple[str, ...]:
-        """How the names of arrays begin whose norms are checked apart from those of all other arrays."""
+        """Prefixes of the names of arrays whose norms are checked apart from those of all other arrays."""
         return ()
 
     def exchange(self, round: int, uploads: Mapping[int, Payload]) -> dict[int, Payload]:
         """Check the uploads, and aggregate those that pass.
 
-        A client whose upload is rejected is treated as if it were absent: it receives nothing now, and what :meth:`catch_up`
-        says before it trains again. Only in the setup before the first round, where it has nothing yet, it receives that at
-        once.
+        A client whose upload is rejected is treated as if it were absent: it receives nothing now, and the payload of
+        :meth:`catch_up` before it trains again. Only in the setup before the first round, when it has nothing yet, it
+        receives that payload at once.
 
         :param round: 0 before the first round, h after the h-th
         :param uploads: payload by client id
         :return: broadcast by client id, for those that receive one
-        :raises ClientError: where the setup finds no upload that it can use
+        :raises ClientError: if the setup finds no valid upload
         """
         self.rejected = {}
         if self.upload_bound is not None:
@@ -81,7 +81,7 @@ class Strategy(ABC):
         return broadcasts
 
     def catch_up(self, client: int) -> Payload:
-        """What a client that missed exchanges receives before it trains again."""
+        """The payload for a client that has missed exchanges, before it trains again."""
         payload = self.latest(client)
         self._remember({client: payload})
         return payload
@@ -101,18 +101,18 @@ class Strategy(ABC):
         """
 
     def latest(self, client: int) -> Payload:
-        """What a client is to have that received nothing in the last exchanges."""
+        """The current broadcast for a client that received nothing in the last exchanges."""
         return {}
 
     def save_state(self) -> State:
         """Everything that the server remembers, as plain data for a checkpoint: all attributes.
 
-        :raises ValueError: where an attribute is neither plain data nor has ``save_state`` and ``load_state`` itself
+        :raises ValueError: if an attribute is not plain data and has no ``save_state`` and ``load_state`` itself
         """
         return {name: _saved(value) for name, value in vars(self).items()}
 
     def load_state(self, state: State) -> None:
-        """Go on from what :meth:`save_state` returned, on a strategy with the same settings."""
+        """Restore what :meth:`save_state` returned, in a strategy with the same settings."""
         for name, saved in state.items():
             own: Any = getattr(self, name, None)
             if hasattr(own, "load_state"):

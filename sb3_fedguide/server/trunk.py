@@ -17,12 +17,12 @@ from sb3_fedguide.server.validation import check_uploads
 
 logger = logging.getLogger(__name__)
 
-#: How the names of what the server sends begin: merged observation moments, and the trunk's parameters.
+#: Prefixes of the server's payloads: merged observation moments, and the trunk's parameters.
 MOMENTS, TRUNK = "moments.", "trunk."
 
-#: Beyond what moments are no observations': their merged mean would be one client's alone, or overflow.
+#: Larger moments cannot come from observations: the merged mean would be that of one client, or overflow.
 _LARGEST, _MOST_SAMPLES = 1e12, 2**40
-#: The longest training of the trunk that one client may ask of all, in medians of the clients'.
+#: The longest training of the trunk that one client may request, in medians of the clients' requests.
 _MOST_UPDATES = 100
 
 
@@ -51,7 +51,7 @@ def moments_fault(moments: Payload) -> str | None:
 
 
 def excessive_updates(n_updates: Mapping[int, int]) -> dict[int, str]:
-    """Clients that would have all train far longer than most say, with the reason."""
+    """Clients that ask for a far longer training than most others, with the reason."""
     usual = float(np.median(list(n_updates.values())))
     return {
         client: f"it wants {n} updates, {n / usual:.3g} times the clients' median"
@@ -61,9 +61,9 @@ def excessive_updates(n_updates: Mapping[int, int]) -> dict[int, str]:
 
 
 class TrunkAverages:
-    """Where the trunk's pretraining stands.
+    """The progress of the trunk's pretraining.
 
-    :param moments: of each client that takes part; who is not among them does not take part
+    :param moments: of each client that takes part
     :param n_updates: updates of each client
     :param average_every: updates between two averages
     :param upload_bound: as in :func:`~sb3_fedguide.server.validation.check_uploads`; ``None`` for no checks
@@ -87,26 +87,26 @@ class TrunkAverages:
         return self.n_done == self.n_updates
 
     def payload(self) -> Payload:
-        """What a client continues from, or, at the end, what everyone begins with."""
+        """The parameters from which a client continues, or, at the end, those of the finished trunk."""
         moments = {f"{MOMENTS}mean": self.mean, f"{MOMENTS}std": self.std}
         return moments | {TRUNK + name: array for name, array in self.trunk.items()}
 
     def facts(self) -> dict[str, Any]:
-        """Where the clients' schedules have to stand."""
+        """The update that the clients' schedules must have reached."""
         return {"n_updates": self.n_updates, "n_done": self.n_done, "average_every": self.average_every}
 
     def average(self, uploads: Mapping[int, Payload]) -> dict[int, str]:
-        """Take the average of those uploads that pass the checks.
+        """Average the uploads that pass the checks.
 
         :return: the reason by client for every upload that was rejected
-        :raises ClientError: where none passes
+        :raises ClientError: if none passes
         """
         rejected: dict[int, str] = {}
         if self.upload_bound is not None:
             sent = {client: self.trunk for client in uploads}
             rejected = check_uploads(uploads, sent, bound=self.upload_bound)
         accepted = [client for client in sorted(uploads) if client not in rejected]
-        if not accepted:  # whoever is asked again answers the same
+        if not accepted:  # a client that is asked again answers the same
             reasons = "; ".join(f"client {client}, {reason}" for client, reason in rejected.items())
             raise ClientError(
                 sorted(uploads), f"the server cannot average the trunk, because it rejects every upload: {reasons}"

@@ -1,4 +1,4 @@
-"""Checks of what clients upload, before any of it moves the others: form, finiteness, and norms beside the others' norms."""
+"""Checks of the clients' uploads before aggregation: form, finiteness, and norms compared with the other clients'."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from sb3_fedguide.settings.arguments import UPLOAD_BOUND as UPLOAD_BOUND
 #: An upload's arrays as names with shapes, in the order of names.
 Form = tuple[tuple[str, tuple[int, ...]], ...]
 
-#: Name of the group of every array that no prefix puts elsewhere.
+#: Name of the group of all arrays without one of the prefixes.
 PARAMETERS = "parameters"
 
-#: Below so many uploads there is no majority that could tell an outlier.
+#: With fewer uploads there is no majority that could identify an outlier.
 FEWEST_NORMS = 3
 
 
 def check_uploads(
     uploads: Mapping[int, Payload], sent: Mapping[int, Payload], groups: tuple[str, ...] = (), bound: float = UPLOAD_BOUND
 ) -> dict[int, str]:
-    """Which uploads of an exchange are not to be used, and why.
+    """The uploads of an exchange that are rejected, and why.
 
     In this order an upload has to
 
-    * be named arrays of float32 (moments of observations: float64), with a positive number of samples where there is one;
+    * be named arrays of float32 (moments of observations: float64), with a positive number of samples if it has one;
     * be finite;
     * have the names and shapes that most of the finite uploads have; with zero samples, some of them and no parameters;
-    * have norms of at most ``median + bound * max(MAD, median / 2)`` of the positive norms of what is still left, from three
-      uploads on. MAD is their median absolute deviation. It is never above the median, so that ``bound`` allows between
+    * have norms of at most ``median + bound * max(MAD, median / 2)`` of the positive norms of the remaining uploads, if there
+      are three or more. MAD is their median absolute deviation. It is never above the median, so that ``bound`` allows between
       ``1 + bound / 2`` and ``1 + bound`` times the median.
 
-    The norm of parameters is that of the client's change since what it was last sent, or, of what it was never sent, that of
-    the distance from the uploads' median. Arrays of the other groups are taken whole: a head is meant to differ.
+    The norm of parameters is that of their difference from the last broadcast to the client, or, before the first broadcast,
+    from the uploads' median. Other groups have the norm of the arrays themselves: a head should differ.
 
-    An upload that is wrong in its direction only passes: a norm does not see it.
+    An upload with only a wrong direction passes: a norm does not detect it.
 
     :param uploads: payload by client id
-    :param sent: what each client was last sent
+    :param sent: the last broadcast to each client
     :param groups: names that begin with the same one of these have a norm of their own; all others are parameters, and have
         one together
     :param bound: see above
-    :return: the reason by client for every upload that is to be rejected
+    :return: the reason by client for every rejected upload
     """
     reasons = {client: reason for client in sorted(uploads) if (reason := broken(uploads[client], groups))}
     forms = {client: form(uploads[client]) for client in sorted(uploads) if client not in reasons}
@@ -72,7 +72,7 @@ def check_uploads(
 
 
 def group_norms(upload: Payload, reference: Payload, groups: tuple[str, ...]) -> dict[str, float]:
-    """Norm of each group of an upload's arrays, and of its parameters less the reference."""
+    """Norm of each group of an upload's arrays, and of its parameters minus the reference."""
     squares: dict[str, float] = {}
     for name, array in upload.items():
         values = np.asarray(array, dtype=np.float64)
@@ -105,7 +105,7 @@ def norm_limit(norms: list[float], bound: float) -> float:
 
 
 def is_idle(upload: Payload) -> bool:
-    """Whether an upload says that there is nothing of its client to average: it holds zero samples."""
+    """Whether an upload has zero samples, so that its client has no weight in averages."""
     return N_SAMPLES in upload and not np.any(upload[N_SAMPLES])
 
 

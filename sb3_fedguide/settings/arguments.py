@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Schedule = Callable[[float], float]
 #: What the server averages: everything, the actor with ``log_std``, or the critic.
 Average = Literal["all", "actor", "critic"]
-#: What can take the place of the average, see :func:`sb3_fedguide.server.averaging.combine`.
+#: Ways to combine uploads, see :func:`sb3_fedguide.server.averaging.combine`.
 Aggregator = Literal["mean", "median", "trimmed_mean"]
 #: Nothing, statistics per client, or observation statistics that all clients share.
 Normalize = bool | Literal["shared"]
@@ -124,9 +124,9 @@ class AveragingArguments:
     average_every: Count = 1
     average_until: Count | None = None
     aggregator: Aggregator = "mean"
-    trim_fraction: Annotated[float, Range(0, 0.5, "so much is left out on either side", without_high=True)] = 0.25
+    trim_fraction: Annotated[float, Range(0, 0.5, "it is the share left out on either side", without_high=True)] = 0.25
     server_step: ServerStep = 1.0
-    server_momentum: Annotated[float, Range(0, 1, "it is what is kept of the last update", without_high=True)] = 0.0
+    server_momentum: Annotated[float, Range(0, 1, "it is the share of the last update that is added", without_high=True)] = 0.0
     mix: Mix | Schedule = 1.0
     screening: Tested = 0.0
     noise_multiplier: Annotated[float, Range(0, 1e6)] = 0.0

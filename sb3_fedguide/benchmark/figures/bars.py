@@ -31,7 +31,7 @@ _WORST: dict[str, Any] = {**_DOT, "markersize": 5.5, "markerfacecolor": "black",
 def draw_bars(comparison: Comparison) -> Figure:
     """F and the worst client, a row of two panels per family; the lowest seed's F is W.
 
-    :raises ValueError: where no run is finished
+    :raises ValueError: if no run is finished
     """
     found = require_finished(comparison)
     rows = max(len(results) for results in found.values())
@@ -61,11 +61,11 @@ def draw_bars(comparison: Comparison) -> Figure:
 
 
 def draw_speed_up(comparison: Comparison, baseline: str = "local") -> Figure:
-    """With how many times fewer environment steps than a run a method reaches the baseline's F, one panel per family.
+    """Speed-up: environment steps of a run over those until a method reaches the baseline's F, one panel per family.
 
     Families without the baseline, or without another method, are left out.
 
-    :raises ValueError: where none is left
+    :raises ValueError: if none is left
     """
     found = {
         family: results
@@ -103,7 +103,7 @@ def draw_speed_up(comparison: Comparison, baseline: str = "local") -> Figure:
 def draw_cv(comparison: Comparison) -> Figure:
     """How much the return still moves in the last twenty rounds, one panel per family.
 
-    :raises ValueError: where no run has evaluated enough of its last rounds
+    :raises ValueError: if no run has evaluated enough of its last rounds
     """
     values = {
         family: {

@@ -61,7 +61,7 @@ def client_returns(results: Mapping[str, Sequence[Result]]) -> ClientReturns:
     """Final returns of one family's clients.
 
     :param results: name of a method to its results
-    :raises ValueError: where a file does not have the clients' returns
+    :raises ValueError: if a file does not have the clients' returns
     """
     for group in results.values():
         for result in group:
@@ -83,7 +83,7 @@ def client_returns(results: Mapping[str, Sequence[Result]]) -> ClientReturns:
 def draw_clients(family: str, runs: Runs) -> Figure:
     """A row per method and a column per client; colours are shares of a client's best return, numbers are returns.
 
-    :raises ValueError: where no run is finished, or a file does not have the clients' returns
+    :raises ValueError: if no run is finished, or a file does not have the clients' returns
     """
     if not (results := finished(runs)):
         raise ValueError(f"no run on {family} is finished")

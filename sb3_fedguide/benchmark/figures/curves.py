@@ -55,7 +55,7 @@ def curve(runs: Sequence[Run], values: Sequence[np.ndarray], x: str = "rounds", 
     :param values: what to average, one array ``(n_evaluations,)`` per run
     :param x: one of :data:`~sb3_fedguide.benchmark.figures.runs.AXES`
     :param band: one of :data:`BANDS`
-    :raises ValueError: where a run's files do not say what ``x`` needs
+    :raises ValueError: if a run's files do not say what ``x`` needs
     """
     common = sorted(set.intersection(*(set(run.rounds.tolist()) for run in runs)))
     if not common:
@@ -77,7 +77,7 @@ def draw_curves(comparison: Comparison, of: str = "average", x: str = "rounds", 
     """One panel per family.
 
     :param of: ``"average"`` over clients, or the ``"worst"`` client in each evaluation
-    :raises ValueError: where a run's files do not say what is asked for
+    :raises ValueError: if a run's files do not say what is asked for
     """
     curves = {
         family: {name: curve(group, [run.of(of) for run in group], x, band) for name, group in runs.items()}
@@ -100,7 +100,7 @@ def draw_curves(comparison: Comparison, of: str = "average", x: str = "rounds", 
 def draw_client_curves(family: str, runs: Runs, x: str = "rounds", band: str = "range") -> Figure:
     """One small panel per client of a family.
 
-    :raises ValueError: where a run's files do not say what is asked for
+    :raises ValueError: if a run's files do not say what is asked for
     """
     every = [run for group in runs.values() for run in group]
     returns = {run.source: run.client_returns() for run in every}

@@ -1,4 +1,4 @@
-"""What figures of a comparison share: panels, scales, legends beside the data, and files."""
+"""Common parts of a comparison's figures: panels, scales, legends beside the data, and files."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def files(name: str) -> list[str]:
 def save(figure: Figure, folder: Path, name: str) -> list[Path]:
     """Write a figure as PNG and PDF; the same figure gives the same bytes.
 
-    :raises OSError: where a file cannot be written
+    :raises OSError: if a file cannot be written
     """
     paths = [folder / file for file in files(name)]
     for path, suffix in zip(paths, FORMATS, strict=True):

@@ -1,4 +1,4 @@
-"""The transport plan over rounds: who listens to whom, what the experts carry, and how many a client uses."""
+"""The transport plan over rounds: shares of heads in priors, loads of the experts, and the experts that a client uses."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ MAX_WRITTEN = 12
 
 
 def draw_plans(plans: Plans, title: str, method: str = "fedguide") -> Figure:
-    """Above, what each client's prior holds of every client's head, in three rounds; below, three measures over rounds.
+    """Above, the share of every client's head in each client's prior, in three rounds; below, three measures over rounds.
 
-    :param title: which run it is
+    :param title: name of the run
     :param method: name of its algorithm
-    :raises ValueError: where there is only the plan before the first round
+    :raises ValueError: if there is only the plan before the first round
     """
     after = np.flatnonzero(plans.rounds > 0)
     if not len(after):

@@ -1,4 +1,4 @@
-"""What figures of a comparison are drawn from: runs with their evaluations, by family and by method."""
+"""The data of a comparison's figures: runs with their evaluations, by family and by method."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Run:
     :param rounds: those that were evaluated, ``(n_evaluations,)``
     :param average: client-average return, ``(n_evaluations,)``
     :param clients: the clients' numbers; empty where an older file does not say
-    :param returns: of each client, ``(n_evaluations, n_clients)``; ``None`` where an older file does not say
+    :param returns: of each client, ``(n_evaluations, n_clients)``; ``None`` if an older file does not say
     :param steps: environment steps of all clients until the evaluation, those of tests included, ``(n_evaluations,)``
     :param seconds: of rollout, training and exchange until then, the run's total spread evenly over its rounds
     :param n_bytes: up and down, of all clients together, until then; those of the rounds are spread evenly over them
-    :param result: final measures; ``None`` where the run is not finished
+    :param result: final measures; ``None`` if the run is not finished
     """
 
     method: str
@@ -57,7 +57,7 @@ class Run:
     def axis(self, x: str) -> np.ndarray:
         """Where the evaluations lie on the axis ``x``, one of :data:`AXES`.
 
-        :raises ValueError: where the run's files do not say
+        :raises ValueError: if the run's files do not say
         """
         found = {"rounds": self.rounds, "steps": self.steps, "seconds": self.seconds, "bytes": self.n_bytes}[x]
         if found is None:
@@ -67,14 +67,14 @@ class Run:
     def of(self, what: str) -> np.ndarray:
         """The curve of the clients' ``"average"``, or of the ``"worst"`` client of each evaluation.
 
-        :raises ValueError: where the run's files do not say
+        :raises ValueError: if the run's files do not say
         """
         return self.average if what == "average" else self.client_returns().min(axis=1)
 
     def client_returns(self) -> np.ndarray:
         """``returns``.
 
-        :raises ValueError: where the run's files do not have them
+        :raises ValueError: if the run's files do not have them
         """
         if self.returns is None:
             raise ValueError(
@@ -117,14 +117,14 @@ def from_result(result: Result, name: str | None = None, variant: int = 0) -> Ru
 
 
 def seconds_at(rounds: np.ndarray, result: Result) -> np.ndarray | None:
-    """Seconds of rollout, training and exchange until the end of each round; ``None`` where the file does not say."""
+    """Seconds of rollout, training and exchange until the end of each round; ``None`` if the file does not say."""
     return None if result.round_seconds is None else result.round_seconds * rounds / result.n_rounds
 
 
 def bytes_at(rounds: np.ndarray, result: Result) -> np.ndarray:
     """Bytes of all clients until the end of each round.
 
-    Where a file of an earlier version does not tell what was sent before the first round, that is spread like the rest.
+    If a file of an earlier version does not separate the bytes before the first round, they are spread like the rest.
     """
     before = (result.offline_bytes_up or 0.0) + (result.offline_bytes_down or 0.0)
     return before + (result.total_bytes - before) * rounds / result.n_rounds
@@ -139,7 +139,7 @@ def finished(runs: Runs) -> dict[str, list[Result]]:
 def require_finished(comparison: Comparison) -> dict[str, dict[str, list[Result]]]:
     """Family to name to results.
 
-    :raises ValueError: where no run is finished
+    :raises ValueError: if no run is finished
     """
     found = {family: finished(runs) for family, runs in comparison.items()}
     found = {family: results for family, results in found.items() if results}

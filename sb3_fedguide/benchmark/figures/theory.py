@@ -64,7 +64,7 @@ class Reduction:
 
 
 def reduction(scalars: Scalars) -> Reduction:
-    """:raises ValueError: where the run has logged nothing of Lemma 2: it has no V_phi"""
+    """:raises ValueError: if the run has logged nothing of Lemma 2: it has no V_phi"""
     clients = [values for key, values in scalars.items() if KAPPA.fullmatch(key)]
     rounds = sorted(scalars.get(ONLINE, {}).keys() & scalars.get(BLEND, {}).keys())
     rounds = [round for round in rounds if any(round in values for values in clients)]
@@ -86,7 +86,7 @@ def reduction(scalars: Scalars) -> Reduction:
 def averaging_points(scalars: Scalars) -> np.ndarray:
     """Theorem 3 in each round that evaluated both sides: dispersion and absolute change of the return, ``(n_rounds, 2)``.
 
-    :raises ValueError: where there is no such round
+    :raises ValueError: if there is no such round
     """
     rounds = sorted(scalars.get(DISPERSION, {}).keys() & scalars.get(CHANGE, {}).keys())
     if not rounds:
@@ -103,7 +103,7 @@ def bound_constant(points: np.ndarray) -> float:
 def draw_lemma2(logs: Sequence[Log]) -> Figure:
     """A row per family: kappa, and the variance with V_phi over that without it, by round.
 
-    :raises ValueError: where no run has a V_phi
+    :raises ValueError: if no run has a V_phi
     """
     found = _readable(logs, reduction)
     families = list(dict.fromkeys(log.family for log, _ in found))
@@ -135,7 +135,7 @@ def draw_theorem3(logs: Sequence[Log]) -> Figure:
     Both axes are logarithmic, where the bound is a line of slope one half. Rounds in which one of the two is zero are left
     out.
 
-    :raises ValueError: where no run has evaluated its average
+    :raises ValueError: if no run has evaluated its average
     """
     found = _readable(logs, averaging_points)
     families = list(dict.fromkeys(log.family for log, _ in found))

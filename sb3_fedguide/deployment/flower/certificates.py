@@ -24,13 +24,13 @@ _AUTHORITY_DAYS = 3650
 
 
 def write_certificates(folder: Path, hosts: Sequence[str], days: int = 825) -> None:
-    """Write ``server.crt`` and ``server.key``, signed by the authority in ``folder``, which is made where there is none.
+    """Write ``server.crt`` and ``server.key``, signed by the authority in ``folder``; a missing authority is created.
 
-    Of the four files, clients get ``ca.crt`` and nothing else. ``ca.key`` is needed again for the next server certificate.
+    Of the four files, clients get only ``ca.crt``. ``ca.key`` is needed again for the next server certificate.
 
     :param hosts: names and addresses under which clients reach the server
     :param days: how long the server's certificate holds
-    :raises ValueError: for a name that is none, where the files cannot be written, or where the authority ends earlier
+    :raises ValueError: for an invalid name, where the files cannot be written, or if the authority expires earlier
     """
     names = [_general_name(host) for host in dict.fromkeys([*hosts, "localhost", LOOPBACK])]
     try:
@@ -52,7 +52,7 @@ def write_certificates(folder: Path, hosts: Sequence[str], days: int = 825) -> N
     ends = authority.not_valid_after_utc
     if days > (left := (ends - datetime.datetime.now(datetime.UTC)).days):
         raise ValueError(
-            f"{folder / CA} holds until {ends:%Y-%m-%d} only, which a server certificate of {days} days would outlive; "
+            f"{folder / CA} expires on {ends:%Y-%m-%d}, before a server certificate of {days} days; "
             f"{f'give at most {left} days, or ' if left > 0 else ''}remove {CA} and {CA_KEY} to begin with a new authority, "
             f"and replace {CA} on every client"
         )
@@ -74,11 +74,11 @@ def write_key(folder: Path, name: str) -> tuple[Path, Path]:
     """Write a client's key pair, ``name`` and ``name.pub``, in OpenSSH's format on the curve P-384, as Flower wants them.
 
     :return: private and public file
-    :raises ValueError: where there is one already, or the files cannot be written
+    :raises ValueError: if there is one already, or the files cannot be written
     """
     private, public = folder / name, folder / f"{name}.pub"
     if private.exists() or public.exists():
-        raise ValueError(f"{private} is there already; a key that is lost cannot be made again, so remove it yourself")
+        raise ValueError(f"{private} exists already; a lost key cannot be made again, so remove it yourself")
     key = ec.generate_private_key(ec.SECP384R1())
     try:
         folder.mkdir(parents=True, exist_ok=True)

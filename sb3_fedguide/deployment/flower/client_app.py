@@ -22,7 +22,7 @@ app = ClientApp()
 
 @app.train()
 def answer(message: FlowerMessage, context: Context) -> FlowerMessage:
-    """Answer one message. Of an exception, the name of its type is all that leaves this machine."""
+    """Answer one message. Of an exception, only the name of its type leaves this machine."""
     reply: Message | Failure
     try:
         request = from_records(message.content)

@@ -28,9 +28,9 @@ from sb3_fedguide.deployment.site import PARAMETERS, SITE
 _POLL_SECONDS = 0.2
 #: The SuperLink refuses a key for up to a minute after its SuperNode was killed.
 _RESTART_SECONDS = 10.0
-#: In which a process that has answered ends.
+#: Seconds in which a process ends after its answer.
 _EXIT_SECONDS = 5.0
-#: In which the SuperNode delivers the last reply.
+#: Seconds in which the SuperNode delivers the last reply.
 _LAST_SECONDS = 5.0
 
 
@@ -38,7 +38,7 @@ class ClientNode:
     """Keeps a SuperNode running, and answers its messages.
 
     In Flower the server sends the code that its clients run. Here it cannot: of Flower's kinds of tasks this takes
-    messages for a client and no others, and answers them in a fork of this process with the installed
+    only messages for a client, and answers them in a fork of this process with the installed
     :mod:`sb3_fedguide.deployment.flower.client_app`. What the server sent as an app is neither unpacked nor installed.
 
     :param server: ``host:port``
@@ -59,11 +59,11 @@ class ClientNode:
 
     @property
     def finished(self) -> bool:
-        """Whether the federation has come to its end."""
+        """Whether the federation has ended."""
         return (self._folder / FINISHED).exists()
 
     def run(self) -> None:
-        """Run until the federation has come to its end; where it has already, there is nothing to run for."""
+        """Run until the federation ends; return at once if it has ended already."""
         if not (self._folder / SITE / PARAMETERS).exists():  # it was not prepared when the end came
             (self._folder / FINISHED).unlink(missing_ok=True)
         while not self.finished:
@@ -85,8 +85,8 @@ class ClientNode:
                 if (token := _next_task(client)) is None:
                     time.sleep(_POLL_SECONDS)
                     continue
-                # A SuperNode has one message at a time: a process that is not through with the last one waits for what will
-                # not come, as after a restart of the server.
+                # A SuperNode has one message at a time: a process that still works on the previous one waits for a reply that
+                # will not come, as after a restart of the server.
                 _end(worker, _EXIT_SECONDS)
                 worker = multiprocessing.get_context("fork").Process(target=run_installed_app, args=(address, token))
                 worker.start()

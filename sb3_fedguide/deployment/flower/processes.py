@@ -1,4 +1,4 @@
-"""Flower's own processes: how they are started, and that none stays behind."""
+"""Flower's own processes: how they start, and how all of them end."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flwr.supercore.interceptors import RuntimeVersionHttpInterceptor
 
 from sb3_fedguide.deployment.flower.certificates import LOOPBACK
 
-#: The deployment uses what is no public interface of Flower, and is tested with these releases only.
+#: The deployment uses private interfaces of Flower, and is tested only with these releases.
 FLOWER = "1.41."
 _GRACE_SECONDS = 10.0
 #: Uvicorn, inside the SuperNode, says of itself what Flower's level keeps back.
@@ -47,7 +47,7 @@ def environment(home: Path) -> dict[str, str]:
 
 
 def loopback_without_proxy() -> dict[str, str]:
-    """The variables that keep this machine's own addresses off a proxy, whatever else they say.
+    """The variables that exclude this machine's own addresses from a proxy.
 
     Flower's processes talk to each other over the loopback device, and follow ``http_proxy`` and ``https_proxy``.
     """
@@ -63,13 +63,13 @@ def runtime_version(component: str) -> RuntimeVersionHttpInterceptor:
 
 
 def free_port() -> int:
-    """A port of the loopback device that nobody listens on now."""
+    """A free port of the loopback device."""
     with socket.create_server((LOOPBACK, 0)) as server:
         return server.getsockname()[1]
 
 
 class FlowerProcess:
-    """A Flower command in a process group of its own, which ends with the context, and with this process however that ends.
+    """A Flower command in its own process group, which ends with the context, and when this process ends for any reason.
 
     :param module: where the command's function is, such as ``flwr.superlink.cli``, and ``function``, its name
     :param arguments: of the command

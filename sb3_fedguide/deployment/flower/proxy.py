@@ -1,8 +1,8 @@
-"""What of Flower's SuperLink can be reached from outside: the paths that clients need, and nothing else.
+"""The proxy before Flower's SuperLink: from outside, clients reach only the paths that they need.
 
-The SuperLink has one port for everything. Only what is below ``/v1/fleet/`` asks for a registered key; whoever reaches the
-rest can register keys and start code on the server. So the SuperLink listens on the loopback device, and this proxy answers
-403 to everything but the fleet's paths. It ends TLS, since what is encrypted cannot be filtered.
+The SuperLink has one port for everything. Only paths below ``/v1/fleet/`` require a registered key; a client that reaches
+other paths can register keys and start code on the server. So the SuperLink listens on the loopback device, and this proxy
+answers 403 to everything but the fleet's paths. It terminates TLS, since encrypted requests cannot be filtered.
 """
 
 from __future__ import annotations
@@ -102,8 +102,8 @@ class ProxyServer:
 
     :param address: ``(host, port)`` to listen on
     :param certificate: file of the server's certificate, and ``key`` of its key
-    :param n_clients: for whom connections are kept
-    :raises OSError: where the address cannot be listened on
+    :param n_clients: number of clients, for the limit on connections
+    :raises OSError: if it cannot listen on the address
     """
 
     def __init__(self, address: tuple[str, int], proxy: FleetProxy, certificate: Path, key: Path, n_clients: int) -> None:

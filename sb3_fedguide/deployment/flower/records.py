@@ -15,7 +15,7 @@ _REASON = re.compile(r"error: \w{1,80}")
 
 
 def to_records(content: Message | Failure) -> RecordDict:
-    """What Flower sends of a request or reply."""
+    """The Flower record of a request or reply."""
     if isinstance(content, Failure):
         return RecordDict({_REST: ConfigRecord({"text": json.dumps({"failure": content.reason})})})
     # np.ascontiguousarray would give a number one dimension
@@ -25,14 +25,14 @@ def to_records(content: Message | Failure) -> RecordDict:
 
 
 def from_records(records: RecordDict) -> Message | Failure:
-    """What :func:`to_records` was given, from records that anybody may have sent.
+    """The inverse of :func:`to_records`, for records of untrusted senders.
 
     :raises ValueError: for anything else
     """
     try:
         rest = json.loads(str(records.config_records[_REST]["text"]))
         if "failure" in rest:
-            # Who fails sends the name of a type; no other text of a client is passed on.
+            # A client that fails sends the name of a type; no other text of a client is passed on.
             reason = rest["failure"]
             return Failure(reason if _REASON.fullmatch(reason) else "error: unknown")
         arrays = {name: array.numpy() for name, array in records.array_records[_PAYLOAD].items()}
@@ -40,5 +40,5 @@ def from_records(records: RecordDict) -> Message | Failure:
         if not isinstance(message.round, int) or not isinstance(message.facts, dict):
             raise TypeError("round or facts")
     except Exception as error:  # foreign bytes fail in json, NumPy, Flower and here, each in its own way
-        raise ValueError(f"a message that is none: {type(error).__name__}") from None
+        raise ValueError(f"not a valid message: {type(error).__name__}") from None
     return message

@@ -19,9 +19,9 @@ from sb3_fedguide.deployment.flower.transport import FlowerTransport
 from sb3_fedguide.deployment.serve import TooFewClients, serve
 from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 
-#: Environment variable with the path of what the server is told. Flower's own run configuration would go to the clients.
+#: Environment variable with the path of the server's configuration. Flower's own run configuration would go to the clients.
 CONFIG = "FEDGUIDE_SERVER_CONFIG"
-#: In the server's folder once the federation is over. Flower's process ends with code 0 also where it never got to this app.
+#: In the server's folder once the federation is over. Flower's process ends with code 0 also if it never started this app.
 FINISHED = "finished"
 
 logger = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ app = ServerApp()
 def main(grid: Grid, context: Context) -> None:
     """Run the federation's rounds to the end.
 
-    :raises SystemExit: with code 2 where the configuration or the folder is wrong, 1 where there were too few clients
+    :raises SystemExit: with code 2 if the configuration or the folder is wrong, 1 if there were too few clients
     """
     set_up_journal()
     settings = json.loads(Path(os.environ[CONFIG]).read_text(encoding="utf-8"))
@@ -52,7 +52,7 @@ def main(grid: Grid, context: Context) -> None:
 
 
 def set_up_journal() -> None:
-    """Lines of this package with their time, and of other packages what is wrong and nothing else."""
+    """Log lines of this package with their time, and only warnings and errors of other packages."""
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(message)s", force=True)
     logging.getLogger("sb3_fedguide").setLevel(logging.INFO)
     logging.getLogger("flwr").propagate = False  # it writes to the terminal itself
@@ -77,7 +77,7 @@ class RoundLog:
             "reward": "rollout/ep_rew_mean", "evaluation": "eval/mean_reward", "seconds": "time/server_round",
         }  # fmt: skip
         values = [f"{name} {figures[key]:.4g}" for name, key in shown.items() if key in figures]
-        if values:  # after the last round, clients report their evaluations of what it sent
+        if values:  # after the last round, clients report their evaluations of its broadcast
             logger.info("round %d: %s", round, ", ".join(values))
 
     def close(self) -> None:

@@ -52,11 +52,11 @@ clientapp = "sb3_fedguide.deployment.flower.client_app:app"
 
 
 class ServerNode:
-    """Runs a federation's server; everything that it starts ends with it.
+    """Runs a federation's server; all its processes end with it.
 
     :param listen: host and port that clients connect to
     :param certificates: folder with the authority's and the server's certificate, and the server's key
-    :param keys: id of each client by its public key; no other key is let in
+    :param keys: id of each client by its public key; no other key is accepted
     :param config: file that the server app reads
     :param folder: for Flower's own files
     """
@@ -74,7 +74,7 @@ class ServerNode:
         """Run the federation to its end.
 
         :return: exit code: 0, that of the round loop, or 1 where another part of it failed
-        :raises OSError: where it could not be started
+        :raises OSError: if it could not be started
         """
         (self._folder / FINISHED).unlink(missing_ok=True)
         certificate, key = self._certificates / SERVER, self._certificates / SERVER_KEY
@@ -98,7 +98,7 @@ class ServerNode:
             return self._outcome(app.exit_code)
 
     def _outcome(self, code: int | None) -> int:
-        """The exit code for that of the round loop's process, ``None`` where another process ended first."""
+        """The exit code for that of the round loop's process, ``None`` if another process ended first."""
         if code == 0 and not (self._folder / FINISHED).is_file():
             print(
                 "Flower ended the run before its first round or in the middle of it; start the server again", file=sys.stderr
@@ -121,7 +121,7 @@ class ServerNode:
         raise OSError(f"Flower's SuperLink did not start on {self._address} (exit code {link.exit_code})")
 
     def _register(self, control: ControlHttpClient) -> None:
-        """Make the registered keys those of the configuration."""
+        """Register the keys of the configuration, and unregister all others."""
         registered = {node.public_key: node.node_id for node in control.ListNodes(ListNodesRequest()).nodes_info
                       if node.status != "unregistered"}  # fmt: skip
         for key in registered.keys() - self._keys.keys():
@@ -130,7 +130,7 @@ class ServerNode:
             control.RegisterNode(RegisterNodeRequest(public_key=key, name=f"client {self._keys[key]}"))
 
     def _start_app(self, run: int, link: FlowerProcess) -> FlowerProcess:
-        """Start the process of the round loop, and of no other run that somebody may have started."""
+        """Start the process of the round loop, but no run that another user may have started."""
         client = RuntimeHttpClient.from_server_address(
             self._address, False, self._ca.read_bytes(), [runtime_version("SuperExec")]
         )

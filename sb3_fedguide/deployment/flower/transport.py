@@ -47,7 +47,7 @@ class FlowerTransport:
         replies: dict[int, Message | Failure] = {client: Failure("gone") for client in requests if not sent.get(client)}
         while waiting and time.monotonic() < until:
             for reply in self._grid.pull_messages(list(waiting)):
-                # Error replies come from the SuperLink: who is meant, only the id of the request says.
+                # Error replies come from the SuperLink: only the id of the request identifies the client.
                 if (client := waiting.pop(reply.metadata.reply_to_message_id, None)) is not None:
                     replies[client] = _content(reply)
             if waiting:
