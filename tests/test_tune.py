@@ -143,7 +143,10 @@ def test_the_pruner_sees_every_evaluated_round(quick, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_an_interrupted_trial_goes_on_where_it_was(quick, tmp_path, capfd, number):
+def test_an_interrupted_trial_goes_on_where_it_was(quick, tmp_path, capfd, request, number):
+    earlier = signal.signal(number, signal.default_int_handler)  # a shell's background jobs ignore SIGINT
+    request.addfinalizer(lambda: signal.signal(number, earlier))
+
     def interrupt() -> None:
         while not list(tmp_path.glob("out/*/trial-*/runs/*/fedprox/*/waiting")):
             time.sleep(0.01)
