@@ -5,16 +5,20 @@ from __future__ import annotations
 import inspect
 import subprocess
 import sys
+import typing
 from pathlib import Path
 
 import pytest
 import torch as th
+from stable_baselines3.common.policies import BasePolicy
 
 import fed_envs
+from sb3_fedguide import FedAvg
 from sb3_fedguide.common.federated_ppo import FederatedPPO
-from sb3_fedguide.registry import ALGORITHMS, algorithm
+from sb3_fedguide.registry import ALGORITHMS, Entry, algorithm
 from sb3_fedguide.settings import schema
 from sb3_fedguide.settings.config import CONFIGURATIONS, OVERLAYS, config_path, parse_params, read_config, resolve
+from sb3_fedguide.settings.networks import StochasticNetworkConfig
 from sb3_fedguide.settings.signatures import constructors, declared
 
 ROOT = Path(__file__).parent.parent
@@ -247,7 +251,29 @@ def test_signatures_show_and_type_checkers_know_every_parameter(algo):
     constructor = next(iter(constructors(cls)))
     taken = constructor.arguments
     assert [*inspect.signature(constructor).parameters] == ["self", *shown]
+    for known in (shown, inspect.signature(constructor).parameters):
+        assert not [name for name, parameter in known.items() if isinstance(parameter.annotation, str)]
+        assert known["policy"].annotation == str | type[BasePolicy] and known["device"].annotation == th.device | str
+        assert fed_envs.FederatedVecEnv in typing.get_args(known["env"].annotation)
     assert [*shown] == [*declared(taken)] and schema.declared_arguments(algo) is taken
+
+
+class Sized(StochasticNetworkConfig):
+    width: int = 8
+
+
+class WithSize(FedAvg):
+    network_config: typing.Any = Sized
+
+
+def test_an_algorithm_of_ones_own_has_its_own_networks(monkeypatch):
+    monkeypatch.setitem(ALGORITHMS, "sized", Entry(__name__, "WithSize"))
+    assert resolve("sized", BANDIT, overrides={"policy_kwargs.width": 4}).values["policy_kwargs"]["width"] == 4
+    with pytest.raises(ValueError, match="width"):
+        resolve("sized", BANDIT, overrides={"policy_kwargs.widht": 4})
+    monkeypatch.setattr(WithSize, "network_config", "Sized")
+    with pytest.raises(ValueError, match=r"network_config must be a subclass of .*NetworkConfig, not 'Sized'"):
+        resolve("sized", BANDIT)
 
 
 WRONG_CALLS = """
@@ -259,6 +285,7 @@ Local("MlpPolicy", "HopperHard", mu=1)
 FedRL("MlpPolicy", "HopperHard", n_epochs=3)
 FedGuideA("MlpPolicy", "HopperHard", average="every")
 Mine("MlpPolicy", "HopperHard", mu=1)
+FedKL("MlpPolicy", 3)
 """
 
 
@@ -268,4 +295,4 @@ def test_a_type_checker_refuses_what_constructors_do_not_take(tmp_path):
     path.write_text(WRONG_CALLS)
     result = subprocess.run([sys.executable, "-m", "mypy", str(path)], cwd=ROOT, capture_output=True, text=True)
     wrong = {int(line.split(":")[1]) for line in result.stdout.splitlines() if ": error:" in line}
-    assert wrong == {5, 6, 7, 8, 9}, result.stdout
+    assert wrong == {5, 6, 7, 8, 9, 10}, result.stdout

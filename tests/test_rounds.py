@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ from sb3_fedguide.server.ot_moe import OTMoE
 from sb3_fedguide.server.participants import draw_participants
 from sb3_fedguide.server.rounds import Coordinator, participants
 from sb3_fedguide.server.svrpg import SVRPG
+from sb3_fedguide.settings.ranges import Range
 from sb3_fedguide.settings.schema import hyperparameters
+from sb3_fedguide.settings.signatures import types_of
 from tests.loop_transport import NAME, upload
 
 # --- rounds ---------------------------------------------------------------------------------------------------------------
@@ -63,8 +67,11 @@ def test_participants_are_those_of_a_federation_in_process():
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_a_server_has_the_settings_of_its_model_and_no_others(name):
-    assert complete_settings(name, {}).keys() <= hyperparameters(algorithm(name)).keys()
+def test_a_server_has_the_settings_of_its_model_with_their_types_and_defaults(name):
+    settings, parameters = complete_settings(name, {}), hyperparameters(algorithm(name))
+    assert settings == {key: parameters[key][1] for key in settings}
+    types = types_of(find_method(name).arguments)
+    assert {key: types[key] for key in settings} == {key: parameters[key][0] for key in settings}
     assert method_of(algorithm(name)) is find_method(name)
 
 
@@ -99,6 +106,32 @@ def test_one_definition_for_models_and_servers():
 def test_wrong_settings_are_refused(name, settings, message):
     with pytest.raises(ValueError, match=message):
         make_strategy(name, settings, 3, 0)
+
+
+@dataclass
+class Mine:
+    eta: Annotated[float, Range(1)] = 2.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"eta": -1.0}, "eta=-1 must be positive"),
+        ({"average": "actr"}, "average='actr' must be one of"),
+        ({"noise_multiplier": -1.0}, "noise_multiplier=-1 must"),
+        ({"beta": 2.0}, "beta=2 must be between 0 and 1"),
+        ({"client_fraction": 2.0}, "client_fraction=2 must"),
+    ],
+)
+def test_a_method_of_ones_own_checks_settings_by_name(settings, message):
+    own = {"eta": 0.05, "average": "all", "noise_multiplier": 0.0, "beta": 0.5, "k": 1}
+    with pytest.raises(ValueError, match=message):
+        make_strategy(Method(double, own), settings, 3, 0)
+    assert make_strategy(Method(double, own), {"beta": "auto", "k": 2}, 3, 0).prefixes == ("x",) * 6
+    with pytest.raises(ValueError, match=r"eta=0\.5 must be at least 1"):  # its own range goes first, the others stay
+        make_strategy(Method.of(double, Mine, ["eta"]), {"eta": 0.5}, 3, 0)
+    with pytest.raises(ValueError, match="client_fraction=2 must"):
+        make_strategy(Method.of(double, Mine, ["eta"]), {"client_fraction": 2.0}, 3, 0)
 
 
 class Half(FedAvg):

@@ -253,6 +253,24 @@ def test_what_is_not_supported_is_refused_with_a_reason(point_envs, arguments, e
             FederatedPPO(**{"policy": "MlpPolicy", "env": point_envs(2), **arguments})
 
 
+class Halved(FedAvg):
+    def __init__(self, policy, env, kappa: Annotated[float, Range(0, 1)] = 0.5, *more, **fedavg):
+        super().__init__(policy, env, *more, **fedavg)
+
+
+def test_wrong_calls_name_the_class_and_what_is_by_position(point_envs):
+    for make in (FedAvg, FedKL, Local, FedRL):
+        name = make.__name__
+        with pytest.raises(TypeError, match=rf"^{name}\(\) takes policy and env by position and everything else by keyword"):
+            make("MlpPolicy", point_envs(2), 3e-4)
+        with pytest.raises(TypeError, match=rf"^{name}\(\) missing 2 required positional arguments: 'policy' and 'env'"):
+            make()
+    with pytest.raises(ValueError, match="kappa=2 must be between 0 and 1"):
+        Halved("MlpPolicy", point_envs(2), 2.0)
+    with pytest.raises(TypeError, match=r"^FedAvg\(\) takes policy and env by position"):
+        Halved("MlpPolicy", point_envs(2), 0.5, 3e-4)
+
+
 def test_n_steps_off_policy_are_not_those_of_a_rollout(point_envs):
     with pytest.raises(ValueError, match=r"n_steps is not supported: .*one-step returns"):
         FedRL("MlpPolicy", point_envs(2), n_steps=3)

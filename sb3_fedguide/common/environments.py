@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +14,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from fed_envs import FederatedVecEnv
+from sb3_fedguide.settings.argument_types import FederationLike, MaybeFederation
 
 if TYPE_CHECKING:
     from fed_envs import Family
-
-FederationLike = str | Path | Any | Sequence[Callable[[], gym.Env]]
 
 
 class FederatedEnvironments(BaseAlgorithm):
@@ -38,10 +37,10 @@ class FederatedEnvironments(BaseAlgorithm):
         """Make anew what is as large as the number of environments per client, after that has changed."""
 
     @classmethod
-    def load(
+    def load(  # type: ignore[override]  # one VecEnv of SB3's holds a single client
         cls,
         path: str | Path | io.BufferedIOBase,
-        env: FederationLike | None = None,
+        env: MaybeFederation = None,
         device: th.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
@@ -65,34 +64,33 @@ class FederatedEnvironments(BaseAlgorithm):
                 f"{cls.__name__} with the same settings and call import_parameters() with the parameters.npz beside it"
             ) from error
         if env is not None:
-            env = model._matching(env)
-            if env.n_envs_per_client != model.n_envs_per_client:
-                check_copies(model.rollout_size, env.n_envs_per_client)
-                model.n_envs_per_client, model.n_envs = env.n_envs_per_client, env.num_envs
+            matching = model._matching(env)
+            if matching.n_envs_per_client != model.n_envs_per_client:
+                check_copies(model.rollout_size, matching.n_envs_per_client)
+                model.n_envs_per_client, model.n_envs = matching.n_envs_per_client, matching.num_envs
                 model._fit_copies()
-            model.set_env(env, force_reset)
-            env.seed(model.seed)
+            model.set_env(matching, force_reset)
+            matching.seed(model.seed)
         return model
 
-    def set_env(self, env: FederationLike, force_reset: bool = True) -> None:
+    def set_env(self, env: FederationLike, force_reset: bool = True) -> None:  # type: ignore[override]
         """Train in other environments of the same clients; otherwise as in SB3.
 
         :raises ValueError: for environments of other clients, of another family, or with another number of copies
         """
-        env = self._matching(env)
-        if env.n_envs_per_client != self.n_envs_per_client:
+        matching = self._matching(env)
+        if matching.n_envs_per_client != self.n_envs_per_client:
             raise ValueError(
                 f"set_env() keeps the number of environments per client, {self.n_envs_per_client} and not "
-                f"{env.n_envs_per_client}; {type(self).__name__}.load(path, env=...) takes another"
+                f"{matching.n_envs_per_client}; {type(self).__name__}.load(path, env=...) takes another"
             )
-        super().set_env(env, force_reset)
-        self.family = env.family
+        super().set_env(matching, force_reset)
+        self.family = matching.family
 
-    def _matching(self, env: FederationLike) -> FederatedVecEnv:
-        """``env`` with this model's clients in this model's order."""
-        if not isinstance(env, FederatedVecEnv | VecEnv | gym.Env):
-            env = as_federated_env(env, self.n_envs_per_client, self.client_ids)
-        env = as_federated_env(env)
+    def _matching(self, given: FederationLike) -> FederatedVecEnv:
+        """``given`` with this model's clients in this model's order."""
+        made = isinstance(given, VecEnv | gym.Env)
+        env = as_federated_env(given) if made else as_federated_env(given, self.n_envs_per_client, self.client_ids)
         assert isinstance(env, FederatedVecEnv)
         own, theirs = _name(self.family), _name(env.family)
         if own != theirs:
@@ -130,7 +128,7 @@ def check_copies(rollout_size: int, n_envs_per_client: int) -> None:
 
 
 def as_federated_env(
-    env: FederationLike | None,
+    env: MaybeFederation,
     n_envs_per_client: int = 1,
     clients: Sequence[int] | None = None,
     num_threads: int = 1,

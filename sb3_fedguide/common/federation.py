@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 
 from fed_envs import FederatedVecEnv
@@ -17,7 +16,6 @@ from fed_envs.faults import ClientError
 from sb3_fedguide.common.callbacks import ExchangeCallback, RoundCallback, RoundProgressCallback, round_callbacks
 from sb3_fedguide.common.ddpg_policy import StackedDDPGPolicy
 from sb3_fedguide.common.environments import FederatedEnvironments
-from sb3_fedguide.common.environments import FederationLike as FederationLike
 from sb3_fedguide.common.episodes import EpisodeStatistics
 from sb3_fedguide.common.exchange import Exchange
 from sb3_fedguide.common.faults import check_policies, in_round, warn_of_new_episodes
@@ -38,7 +36,6 @@ from sb3_fedguide.settings.participants import n_participants
 if TYPE_CHECKING:
     from sb3_fedguide.engines.engine import Engine
 
-PolicyLike = str | type[ActorCriticPolicy]
 SelfFederation = TypeVar("SelfFederation", bound="Federation")
 
 

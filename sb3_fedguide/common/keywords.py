@@ -112,5 +112,6 @@ class CheckedKeywords(BaseAlgorithm):
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         check_keywords(cls, kwargs)
         types = types_of(cls)
-        check_values(types, {**dict(zip(types, args, strict=False)), **kwargs})
+        by_position = [name for name, known in parameters(cls).items() if known.kind is known.POSITIONAL_OR_KEYWORD]
+        check_values(types, {**dict(zip(by_position, args, strict=False)), **kwargs})
         return super().__new__(cls)

@@ -163,8 +163,7 @@ class Server:
         n_updates, shape = reply.facts.get("n_updates"), self.clients.common["shapes"]["observations"]
         if type(n_updates) is not int or not 1 <= n_updates < 2**53:
             return "it does not say how long its data are to be trained on"
-        reason = moments_fault(reply.payload)
-        return reason or (None if list(reply.payload["mean"].shape) == shape else f"moments of {reply.payload['mean'].shape}")
+        return moments_fault(reply.payload, shape)
 
     def _to_joined(self, request: Message, members: Iterable[int] | None = None) -> dict[int, Message]:
         self._welcome()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from importlib import import_module
 from typing import Any
 
@@ -15,6 +16,7 @@ from sb3_fedguide.server.ot_moe import OTMoE
 from sb3_fedguide.server.payload import DDPG_ACTOR, DDPG_CRITIC, PPO_ACTOR, PPO_CRITIC
 from sb3_fedguide.server.strategy import Composite, Strategy
 from sb3_fedguide.server.svrpg import SVRPG
+from sb3_fedguide.settings import arguments
 from sb3_fedguide.settings.arguments import (
     FedAvgArguments,
     FederationArguments,
@@ -45,7 +47,8 @@ class Method:
 
     :param make: see :data:`Maker`
     :param defaults: its settings beside :data:`COMMON`, under the names that the model's constructor has for them
-    :param arguments: what the model's constructor takes, for the ranges of these settings
+    :param arguments: what the model's constructor takes, for the ranges of these settings; a setting that it does not have is
+        checked as the argument of that name of the algorithms that are here
     """
 
     make: Maker
@@ -114,6 +117,16 @@ def _load(server: str) -> Method:
     return method
 
 
+@functools.cache
+def _types_by_name() -> Mapping[str, Any]:
+    """Name to type of every argument of the algorithms that are here; where they differ, it may have any of their types."""
+    types: dict[str, Any] = {}
+    for kind in [kind for kind in vars(arguments).values() if isinstance(kind, type) and is_dataclass(kind)]:
+        for name, hint in types_of(kind).items():
+            types[name] = hint if types.get(name, hint) == hint else types[name] | hint
+    return types
+
+
 def complete_settings(algorithm: str | Method, given: Settings) -> dict[str, Any]:
     """All settings of a method's server, those not given by their defaults.
 
@@ -140,7 +153,7 @@ def make_strategy(algorithm: str | Method, settings: Settings, n_clients: int, s
     """
     complete = complete_settings(algorithm, settings)
     method = find_method(algorithm) if isinstance(algorithm, str) else algorithm
-    check_values(types_of(method.arguments), complete)
+    check_values({**_types_by_name(), **types_of(method.arguments)}, complete)
     strategy = method.make(complete, n_clients, seed)
     if complete["normalize"] == "shared":
         moments = ObservationMoments(**{name: complete[name] for name in ("aggregator", "trim_fraction") if name in complete})

@@ -33,8 +33,8 @@ def merge_moments(uploads: Sequence[Mapping[str, np.ndarray]]) -> tuple[np.ndarr
     return merged.mean, np.sqrt(merged.var)
 
 
-def moments_fault(moments: Payload) -> str | None:
-    """What is wrong with a client's moments, if anything."""
+def moments_fault(moments: Payload, shape: Sequence[int]) -> str | None:
+    """What is wrong with a client's moments of observations of ``shape``, if anything."""
     arrays = [moments.get(name) for name in (N_SAMPLES, "mean", "var")]
     if len(moments) != 3 or not all(isinstance(array, np.ndarray | np.generic) for array in arrays):
         return "they are not n_samples, mean and var"
@@ -43,8 +43,8 @@ def moments_fault(moments: Payload) -> str | None:
         np.isfinite(array).all() for array in (count, mean, var)
     ):
         return "they are not finite numbers of float64"
-    if count.ndim != 0 or count < 1 or count != np.floor(count) or mean.ndim != 1 or mean.shape != var.shape:
-        return f"their shapes are {count.shape}, {mean.shape} and {var.shape}, or there are no samples"
+    if count.ndim != 0 or count < 1 or count != np.floor(count) or not mean.shape == var.shape == tuple(shape):
+        return f"they are no positive number, mean and variance of {tuple(shape)}: {count.shape}, {mean.shape}, {var.shape}"
     if count > _MOST_SAMPLES or (np.abs(mean) > _LARGEST).any() or (var > _LARGEST).any():
         return f"there are more than 2**40 samples, or their mean or variance is above {_LARGEST:g}"
     return "a variance is negative" if (var < 0).any() else None

@@ -1,8 +1,8 @@
 """What the algorithms' constructors take: name, type with its range, and default of every argument, here and nowhere else.
 
 The constructors take these classes (:func:`~sb3_fedguide.settings.signatures.takes`); the command line, servers and the
-documentation read them, without PyTorch and pydantic. Types that need these are strings, which nobody evaluates here. What an
-argument does stands in the docstring of its algorithm.
+documentation read them, without PyTorch and pydantic. Types that need these are strings, each one name of
+:mod:`sb3_fedguide.settings.argument_types`. What an argument does stands in the docstring of its algorithm.
 """
 
 # Without `from __future__ import annotations`: types are objects, with their ranges.
@@ -14,10 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from sb3_fedguide.settings.ranges import OPEN, Range
 
 if TYPE_CHECKING:
-    import torch as th
-    from stable_baselines3.common.policies import BasePolicy
-
-    from sb3_fedguide.settings.pretraining import PretrainingConfig
+    from sb3_fedguide.settings.argument_types import DeviceLike, MaybeFederation, MaybePretraining, PolicyLike
 
 #: A value for every remaining progress, from 1 down to 0, as in SB3.
 Schedule = Callable[[float], float]
@@ -54,8 +51,8 @@ class FederationArguments:
     policies: ClassVar[tuple[str, ...]] = ("MlpPolicy",)
     network_config: ClassVar[str]
 
-    policy: "str | type[BasePolicy]"
-    env: Any
+    policy: "PolicyLike"
+    env: "MaybeFederation"
     _: KW_ONLY
     rollout_size: Annotated[int, Range(2, 1e7)] = 4096
     batch_size: Size = 64
@@ -67,14 +64,14 @@ class FederationArguments:
     bc_weight: Share = 0.0
     client_fraction: Annotated[float, Range(OPEN, 1)] = 1.0
     upload_bound: Positive | None = UPLOAD_BOUND
-    pretraining: "PretrainingConfig | dict[str, Any] | None" = None
+    pretraining: "MaybePretraining" = None
     cache_dir: str | Path | None = None
     stats_window_size: Count = 100
     tensorboard_log: str | None = None
     policy_kwargs: dict[str, Any] | None = None
     verbose: int = 0
     seed: int | None = None
-    device: "th.device | str" = "cpu"
+    device: "DeviceLike" = "cpu"
     _init_setup_model: bool = True
 
     def of(self, base: type) -> dict[str, Any]:

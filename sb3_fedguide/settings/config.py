@@ -310,7 +310,14 @@ def _policy_type(algo: str) -> Any:
 
 
 def network_config(algo: str) -> type[NetworkConfig]:
-    """What an algorithm's ``policy_kwargs`` are."""
+    """What an algorithm's ``policy_kwargs`` are; one of the user's own may say it in its class, as ``network_config``.
+
+    :raises ValueError: where that is no :class:`~sb3_fedguide.settings.networks.NetworkConfig`
+    """
+    if ALGORITHMS[algo].arguments is None and (own := getattr(algorithm(algo), "network_config", None)) is not None:
+        if not isinstance(own, type) or not issubclass(own, NetworkConfig):
+            raise ValueError(f"{algo}: network_config must be a subclass of settings.networks.NetworkConfig, not {own!r}")
+        return own
     return getattr(networks, schema.declared_arguments(algo).network_config)
 
 

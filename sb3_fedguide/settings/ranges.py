@@ -57,7 +57,7 @@ def options(hint: Any) -> list[Any]:
 
 def plain(hint: Any) -> Any:
     """A type without ranges."""
-    return hint if isinstance(hint, str) else functools.reduce(operator.or_, options(hint))
+    return functools.reduce(operator.or_, options(hint))
 
 
 def is_schedule(option: Any) -> bool:

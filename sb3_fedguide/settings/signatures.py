@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import sys
+import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from importlib import import_module
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from sb3_fedguide.settings.ranges import plain
@@ -26,7 +29,9 @@ def takes(arguments: Callable[P, A]) -> Callable[[Callable[[Any, A], None]], Cal
     def decorate(constructor: Callable[[Any, A], None]) -> Callable[Concatenate[Any, P], None]:
         @functools.wraps(constructor)
         def __init__(self: Any, *args: P.args, **kwargs: P.kwargs) -> None:
-            constructor(self, arguments(*args, **kwargs))
+            own = type(self).__init__ is __init__  # or it is called by a subclass's
+            whose = type(self).__name__ if own else constructor.__qualname__.rpartition(".")[0]
+            constructor(self, _given(arguments, whose, *args, **kwargs))
 
         __init__.arguments, __init__.hands_on = arguments, False  # type: ignore[attr-defined]
         own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
@@ -52,6 +57,20 @@ def adds(arguments: Callable[..., A]) -> Callable[[Callable[..., None]], Callabl
     return decorate
 
 
+def _given(arguments: Callable[P, A], whose: str, *args: P.args, **kwargs: P.kwargs) -> A:
+    """:raises TypeError: for a wrong call, in the name of the class ``whose``"""
+    if len(args) > len(FIRST):
+        raise TypeError(
+            f"{whose}() takes {' and '.join(FIRST)} by position and everything else by keyword, but got {len(args)} arguments "
+            "by position"
+        )
+    try:
+        return arguments(*args, **kwargs)
+    except TypeError as error:
+        name = getattr(arguments, "__qualname__", "")
+        raise TypeError(str(error).replace(f"{name}.__init__()", f"{whose}()")) from None
+
+
 @functools.cache
 def declared(kind: Any) -> Mapping[str, tuple[Any, Any]]:
     """Name to (type, default) of what a class or a dataclass of arguments takes: policy and environments, its own, then those
@@ -60,12 +79,24 @@ def declared(kind: Any) -> Mapping[str, tuple[Any, Any]]:
         return {name: (parameter.annotation, parameter.default) for name, parameter in parameters(kind).items()}
     known = {field.name: field for field in dataclasses.fields(kind)}
     bases: tuple[type, ...] = kind.__mro__  # type: ignore[union-attr]
-    own = [name for cls in bases for name in vars(cls).get("__annotations__", ()) if name in known]
+    own = [(name, cls) for cls in bases for name in vars(cls).get("__annotations__", ()) if name in known]
+    says = {name: cls for name, cls in reversed(own)}
     missing, empty = dataclasses.MISSING, inspect.Parameter.empty
     return {
-        name: (known[name].type, empty if known[name].default is missing else known[name].default)
-        for name in dict.fromkeys([name for name in FIRST if name in known] + own)
+        name: (_hint(says[name], known[name].type), empty if known[name].default is missing else known[name].default)
+        for name in dict.fromkeys([name for name in FIRST if name in known] + [name for name, _ in own])
     }
+
+
+def _hint(cls: type, hint: Any) -> Any:
+    """The type of a dataclass's field. In modules that import annotations from the future it is a string."""
+    if not isinstance(hint, str):
+        return hint
+    field = types.SimpleNamespace(__annotations__={"field": hint})
+    try:
+        return typing.get_type_hints(field, vars(sys.modules[cls.__module__]), include_extras=True)["field"]
+    except NameError:  # one of sb3_fedguide.settings.argument_types
+        return hint
 
 
 @functools.cache
@@ -113,12 +144,19 @@ def _stated(constructor: Any) -> list[inspect.Parameter]:
 
 
 class CompleteSignature:
-    """As ``__signature__`` of a class, it shows :func:`parameters` to ``help()``, ``inspect.signature()`` and IDEs, without
-    their ranges."""
+    """As ``__signature__`` of a class, it shows :func:`parameters` to ``help()``, ``inspect.signature()`` and IDEs: types are
+    resolved and without ranges."""
 
     def __get__(self, instance: Any, owner: type) -> inspect.Signature:
         return _shown(parameters(owner).values())
 
 
 def _shown(known: Iterable[inspect.Parameter]) -> inspect.Signature:
-    return inspect.Signature([parameter.replace(annotation=plain(parameter.annotation)) for parameter in known])
+    return inspect.Signature([parameter.replace(annotation=_resolved(parameter.annotation)) for parameter in known])
+
+
+def _resolved(hint: Any) -> Any:
+    """A type without ranges. One that is a name is looked up with PyTorch, which whoever shows a constructor has loaded."""
+    if isinstance(hint, str):
+        return getattr(import_module("sb3_fedguide.settings.argument_types"), hint, hint)
+    return plain(hint)
