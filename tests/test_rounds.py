@@ -100,6 +100,7 @@ def test_one_definition_for_models_and_servers():
         ("fedguide", {"eta": -1.0}, "eta=-1 must"),
         ("fedavg", {"client_fraction": 0.0}, "client_fraction=0 must"),
         ("fedavg", {"upload_bound": -1.0}, "upload_bound=-1 must"),
+        ("fedavg", {"normalize": "sharde"}, "normalize='sharde' must be"),
         ("fedbest", {}, "unknown algorithm 'fedbest'"),
     ],
 )

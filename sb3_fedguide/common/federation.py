@@ -20,7 +20,7 @@ from sb3_fedguide.common.episodes import EpisodeStatistics
 from sb3_fedguide.common.exchange import Exchange
 from sb3_fedguide.common.faults import check_policies, in_round, warn_of_new_episodes
 from sb3_fedguide.common.keywords import CheckedKeywords
-from sb3_fedguide.common.normalization import FederatedNormalizer, check_normalize
+from sb3_fedguide.common.normalization import FederatedNormalizer
 from sb3_fedguide.common.parameters import ParameterFiles
 from sb3_fedguide.common.participation import ParticipationAdam
 from sb3_fedguide.common.ppo_policy import StackedMlpPolicy
@@ -32,6 +32,7 @@ from sb3_fedguide.server.participants import draw_participants
 from sb3_fedguide.server.strategy import Strategy
 from sb3_fedguide.settings.arguments import FederationArguments
 from sb3_fedguide.settings.participants import n_participants
+from sb3_fedguide.settings.ranges import check_normalize
 
 if TYPE_CHECKING:
     from sb3_fedguide.engines.engine import Engine

@@ -16,12 +16,6 @@ from sb3_fedguide.server.payload import OBSERVATION_COUNT, OBSERVATION_MEAN, OBS
 from sb3_fedguide.settings.arguments import Normalize as Normalize
 
 
-def check_normalize(normalize: Normalize) -> None:
-    """:raises ValueError: for what is none of the choices"""
-    if normalize not in (True, False, "shared"):
-        raise ValueError(f"normalize={normalize!r} must be True, False or 'shared' (observation statistics of all clients)")
-
-
 class RunningMoments:
     """Mean and variance of a stream per client, updated batch by batch (Chan's parallel formula, as in SB3).
 

@@ -25,7 +25,7 @@ from sb3_fedguide.settings.arguments import (
     FedGuideRArguments,
     FedRLArguments,
 )
-from sb3_fedguide.settings.ranges import check_values
+from sb3_fedguide.settings.ranges import check_normalize, check_values
 from sb3_fedguide.settings.signatures import types_of
 
 Settings = Mapping[str, Any]
@@ -130,7 +130,7 @@ def _types_by_name() -> Mapping[str, Any]:
 def complete_settings(algorithm: str | Method, given: Settings) -> dict[str, Any]:
     """All settings of a method's server, those not given by their defaults.
 
-    :raises ValueError: for a setting that the server does not have
+    :raises ValueError: for a setting that the server does not have, and an unknown ``normalize``
     """
     method = find_method(algorithm) if isinstance(algorithm, str) else algorithm
     settings = {**{name: getattr(FederationArguments, name) for name in COMMON}, **method.defaults}
@@ -138,6 +138,7 @@ def complete_settings(algorithm: str | Method, given: Settings) -> dict[str, Any
         whose = f"of {algorithm} " if isinstance(algorithm, str) else ""
         raise ValueError(f"the server {whose}has no setting {unknown[0]!r}; it has {', '.join(sorted(settings))}")
     complete = {**settings, **given}
+    check_normalize(complete["normalize"])
     complete["normalize"] = "shared" if complete["normalize"] == "shared" else False  # what stays with clients is no matter
     return complete
 

@@ -121,3 +121,9 @@ def check_number(name: str, number: Real | float, limits: Range | None = None, s
     high = max(limits.high, limits.start) if scheduled else limits.high
     if not limits.low <= value <= high or (limits.without_high and value == high):
         raise ValueError(f"{name}={value:g} must be {limits.expected(value)}{limits.why and ': ' + limits.why}")
+
+
+def check_normalize(normalize: Any) -> None:
+    """:raises ValueError: for what is none of the choices"""
+    if normalize not in (True, False, "shared"):
+        raise ValueError(f"normalize={normalize!r} must be True, False or 'shared' (observation statistics of all clients)")
