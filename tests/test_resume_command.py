@@ -312,7 +312,7 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_it_used(stopped
     second.write_bytes(content[: len(content) // 2])
     assert command("--resume", str(folder)) == 0
     error = capsys.readouterr().err
-    assert re.fullmatch(r"train\.py: warning: .*round_000004\.npz is damaged.*going on from .*round_000002\.npz\n", error), (
+    assert re.fullmatch(r"train\.py: warning: .*round_000004\.npz is damaged.*resuming from .*round_000002\.npz\n", error), (
         error
     )
     assert same(freeze(results(folder)), freeze(results(tmp_path / "local" / "Bandit2D_1")))
