@@ -34,9 +34,7 @@ class FedKL(AnchoredFedAvg):
     @takes(FedKLArguments)
     def __init__(self, given: FedKLArguments) -> None:
         if given.average == "critic":
-            raise ValueError(
-                "FedKL needs a broadcast policy, and average='critic' broadcasts none; use 'all' or 'actor'"
-            )
+            raise ValueError("FedKL needs a broadcast policy, and average='critic' broadcasts none; use 'all' or 'actor'")
         self.lambda_global = given.lambda_global
         self.lambda_local = given.lambda_local
         self._log_stds: dict[str, th.Tensor | None] = {}

@@ -47,7 +47,9 @@ class FedSVRPGM(FedAvg):
     @takes(FedSVRPGMArguments)
     def __init__(self, given: FedSVRPGMArguments) -> None:
         if given.average == "critic":
-            raise ValueError("FedSVRPG-M shares the actors' directions, and average='critic' shares no actor; use 'all' or 'actor'")
+            raise ValueError(
+                "FedSVRPG-M shares the actors' directions, and average='critic' shares no actor; use 'all' or 'actor'"
+            )
         self.beta = given.beta
         self.reference_every = given.reference_every
         self._reference_actor: StackedActor | None = None

@@ -86,7 +86,7 @@ def evaluate_federation(
     :param predict: actions for observations ``(num_envs, obs_dim)``, client-major
     :param env: one copy per client and episode
     :param seed: of the episodes
-    :param active: ``(n_clients, n_episodes)`` bool, which of them to run; all if ``None``. The results of the others are undefined
+    :param active: ``(n_clients, n_episodes)`` bool, episodes to run; all if ``None``. Results of the others are undefined
     :param max_steps: of an episode
     :raises ClientError: for clients with an episode that does not end before
     """
