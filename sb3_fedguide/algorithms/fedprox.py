@@ -40,7 +40,8 @@ class AnchoredFedAvg(FedAvg):
 class FedProx(AnchoredFedAvg):
     """FedAvg whose clients minimise ``L_PPO + mu / 2 * ||theta - theta_bar||^2``.
 
-    ``theta_bar`` is the last broadcast. The term covers the averaged parameters: actor (with ``log_std``) and critic by default.
+    ``theta_bar`` is the last broadcast. The term covers the averaged parameters: by default actor (with ``log_std``) and
+    critic.
     ``mu = 0`` is FedAvg.
 
     Paper: https://arxiv.org/abs/1812.06127 (Eq. 2)

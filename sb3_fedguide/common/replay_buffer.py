@@ -56,10 +56,10 @@ class FederatedReplayBuffer(ReplayBuffer):
         # Not ReplayBuffer's constructor: its arrays have no client axis, and its capacity is divided among environments.
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_clients * n_envs_per_client)
         self.n_clients, self.n_envs_per_client = n_clients, n_envs_per_client
-        #: whose transitions these are, in the order of the arrays
+        #: owners of the transitions, in the order of the arrays
         self.client_ids = list(range(n_clients))
         self.optimize_memory_usage, self.handle_timeout_termination = False, True
-        #: transitions that each client holds, and where its next one goes, ``(n_clients,)``
+        #: each client's number of transitions, and the position of its next one, ``(n_clients,)``
         self.sizes, self.positions = np.zeros(n_clients, dtype=int), np.zeros(n_clients, dtype=int)
         rows = (buffer_size, n_clients)
         self.observations = np.zeros((*rows, *observation_space.shape), dtype=np.float32)

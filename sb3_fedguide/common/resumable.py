@@ -68,7 +68,7 @@ class Resumable(BaseAlgorithm):
         }
 
     def _setup_state(self) -> None:
-        """Set the initial state of a new model of this method, in its shapes: the last step of ``_setup_model()``."""
+        """Set the initial state of a new model, in its final shapes: the last step of ``_setup_model()``."""
 
     def hold(self, **values: Any) -> None:
         """Set the attributes ``values`` unless they came with a saved model: for :meth:`_setup_state`."""
@@ -96,7 +96,7 @@ class Resumable(BaseAlgorithm):
         forgotten = self._forgotten(state["attributes"].keys() | state["shared"].keys())
         if forgotten:
             raise ValueError(
-                f"{type(self).__name__} keeps arrays in {', '.join(forgotten)}, which checkpoints would not hold: name them in "
+                f"{type(self).__name__} keeps arrays in {', '.join(forgotten)}, which no checkpoint would hold: name them in "
                 "its state_attributes, or in _excluded_save_params() if every round makes them anew"
             )
         return state

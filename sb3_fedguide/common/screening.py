@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 EPISODES = 5
 #: Margin by which a policy must be better in a test, relative to the scale of the client's returns.
 MARGIN = 0.1
-XX
+#: Round of the first test; largest number of rounds between two tests.
 FIRST_ROUND, LONGEST_WAIT = 1, 16
 #: Largest share of the remaining test steps for one test.
 PART = 0.25

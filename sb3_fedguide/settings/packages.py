@@ -1,4 +1,4 @@
-"""Modules of the user's own, which register environments and algorithms."""
+"""The user's own modules, which register environments and algorithms."""
 
 from __future__ import annotations
 
