@@ -212,7 +212,7 @@ def test_a_client_that_has_finished_ends_at_once(
     (folder / "finished").touch()
     assert command() == 0
     said = capsys.readouterr()
-    assert "the federation has had its last round; a new one needs a folder other than" in said.out
+    assert "the federation has finished its last round; a new one needs a folder other than" in said.out
     assert "does not answer" not in said.out
     assert command(seed=1) == 2
     assert "is of another run: its seed is 0, here 1" in capsys.readouterr().err

@@ -32,7 +32,7 @@ Maker = Callable[[Settings, int, int], Strategy | None]
 
 #: Settings of every server.
 COMMON = ("client_fraction", "upload_bound", "normalize")
-#: Settings of an averaging method's server. Clipping and noise of uploads are among them, since all clients must have the same.
+#: Settings of an averaging method's server. Clipping and noise of uploads are included: all clients must have the same.
 OF_AVERAGING = ("average_every", "average_until", "aggregator", "trim_fraction", "server_step", "server_momentum")
 AVERAGING = ("average", *OF_AVERAGING, "noise_multiplier", "clipping_norm")
 EXPERTISE = ("n_experts", "eta", "cost", "cost_scaling")

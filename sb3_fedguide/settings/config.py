@@ -49,7 +49,7 @@ class _Loader(yaml.SafeLoader):
         names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.value != "<<"]
         for name in names:
             if names.count(name) > 1:
-                raise yaml.YAMLError(f"the key {name!r} stands twice in one mapping, line {node.start_mark.line + 1}")
+                raise yaml.YAMLError(f"the key {name!r} is given twice in one mapping, line {node.start_mark.line + 1}")
         return super().construct_mapping(node, deep)
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
