@@ -38,7 +38,7 @@ class FedGuide(FederatedPPO):
 
     ``L = PPO + vf_coef * MSE(V) + lambda_trust * KL(pi_old || pi) + lambda_prior(h) * R_prior``.
 
-    Paper: FedGuide (see ``docs/fedguide.md`` for where this implementation decides otherwise)
+    Paper: FedGuide (``docs/fedguide.md`` lists the differences of this implementation)
 
     :param lambda_trust: lambda_1, weight of the exact Gaussian trust-region term
     :param lambda_prior: lambda_2, weight of the prior term in the first round

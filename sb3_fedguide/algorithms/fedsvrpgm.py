@@ -63,7 +63,7 @@ class FedSVRPGM(FedAvg):
         actors = snapshot(self.policy, ACTOR_PREFIXES)
         zeros, more_zeros = ({name: np.zeros_like(array) for name, array in actors.items()} for _ in range(2))
         self.hold(reference=actors, reference_period=np.full(self.n_clients, -1), momentum=zeros, directions=more_zeros)
-        super()._setup_state()  # looks at what is uploaded
+        super()._setup_state()  # reads the names of uploaded parameters
 
     def upload(self, index: int) -> Payload:
         """Parameters and number of samples as in FedAvg, and ``direction.<actor parameter>``."""

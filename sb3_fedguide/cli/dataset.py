@@ -51,7 +51,7 @@ def _parser(prog: str, columns: dict[str, tuple[str, ...]]) -> OneLineParser:
 
 
 def _action_space(arguments: argparse.Namespace) -> Space:
-    """:raises ValueError: where the flags do not say what it is"""
+    """:raises ValueError: if the flags do not define it"""
     import gymnasium
     import numpy as np
 

@@ -86,7 +86,7 @@ def _parser(prog: str) -> OneLineParser:
 
 
 def _read_run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Config, Family]:
-    """:raises ValueError: if the folder is not that of a trained run, or its algorithm or world needs a module to be imported"""
+    """:raises ValueError: if the folder is not that of a trained run, or needs a module for its algorithm or world"""
     from sb3_fedguide.settings.config import read_yaml
 
     folder = Path(arguments.run)

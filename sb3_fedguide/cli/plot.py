@@ -92,7 +92,7 @@ def _parse(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
     flag("-x", choices=("rounds", "steps", "seconds", "bytes"), help="x axis of learning curves; by default rounds")
     flag("--of", choices=("average", "worst", "clients"), help="content of learning curves: the clients' average (default), "
          "the worst client, or each client in its own panel")  # fmt: skip
-    flag("--band", choices=("range", "bootstrap"), help="band of learning curves: from the lowest to the highest seed (default), "
+    flag("--band", choices=("range", "bootstrap"), help="band of learning curves: lowest to highest seed (default), "
          "or the 95 %% bootstrap interval of the mean over seeds")  # fmt: skip
     flag("-o", "--output", default="figures", metavar="DIR", help="folder to write to")
     for action in parser._actions:

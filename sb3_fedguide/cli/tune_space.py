@@ -48,7 +48,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Space:
-    """Name (dotted where nested) to a list of values or an interval."""
+    """Name (dotted if nested) to a list of values or an interval."""
 
     entries: Mapping[str, list[Any] | Interval]
 

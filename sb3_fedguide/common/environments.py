@@ -35,7 +35,7 @@ class FederatedEnvironments(BaseAlgorithm):
 
     @abstractmethod
     def _fit_copies(self) -> None:
-        """Make all arrays anew whose size depends on the number of environments per client, after it has changed."""
+        """Make anew all arrays that depend on the number of environments per client, after it has changed."""
 
     @classmethod
     def load(
@@ -115,7 +115,7 @@ class FederatedEnvironments(BaseAlgorithm):
 
     @staticmethod
     def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        """Accept everything that a federation can be made of, also where SB3 takes an environment."""
+        """Accept all forms of a federation's environments, also as SB3's ``env`` argument."""
         wrapped = as_federated_env(env)
         assert wrapped is not None
         return BaseAlgorithm._wrap_env(wrapped, verbose, monitor_wrapper)

@@ -201,7 +201,7 @@ class FederatedEvalCallback(RoundCallback):
     def _on_round_end(self) -> None:
         round = self.model.round
         if not self.model.sends_policy(round):
-            self.last.pop("broadcast", None)  # nobody has that policy any more
+            self.last.pop("broadcast", None)  # no client has that policy now
         elif broadcast_is_due(round, self.n_rounds, self.eval_freq):
             evaluation = self._evaluate("broadcast", round)
             self.logger.record("eval/broadcast_mean_reward", evaluation.average)

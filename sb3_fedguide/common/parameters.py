@@ -129,7 +129,7 @@ def _read(model: ParameterFiles, path: str | Path) -> None:
     """Read a file of :func:`_write`; a file that does not fit does not change the model.
 
     :raises ValueError: for a file that is absent, damaged, pickled, of another version, or of another federation; the
-        message says what differs
+        message names the differences
     """
     header, arrays = _open(path)
     differences = [

@@ -126,7 +126,7 @@ class UploadPrivacy:
             raise ValueError(f"noise_multiplier and clipping_norm do not protect {', '.join(unprotected)}, which it uploads")
         n_samples = payload[N_SAMPLES]
         if not n_samples:
-            if model.mix_now() == 0:  # as for everybody
+            if model.mix_now() == 0:  # as for all clients
                 return {N_SAMPLES: n_samples}
             values, n_samples = known, np.array(model.rollout_size, dtype=np.float32)
         others = {name: payload[name] for name in apart}

@@ -85,7 +85,7 @@ class Config:
     def make(self, env: Any, **arguments: Any) -> FederatedPPO | FederatedDDPG:
         """Construct the algorithm.
 
-        :param env: whatever a federation can be made of
+        :param env: as for the algorithm's constructor
         :param arguments: constructor arguments that are not hyperparameters, such as ``seed``
         :raises ValueError: if the values do not fit together
         """

@@ -46,7 +46,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read what :func:`write_arrays` wrote.
+    """Read a file of :func:`write_arrays`.
 
     :raises ValueError: if the file is damaged, pickled or does not have the checksum of its content
     :raises FileNotFoundError: if there is none
