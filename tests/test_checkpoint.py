@@ -142,11 +142,11 @@ def test_a_crafted_file_executes_nothing(tmp_path, monkeypatch):
     ("text", "message"),
     [
         ('{"format": 2, "state": {}}', "format 2 and this version reads 3: resume it with the version of the package"),
-        ('{"state": {}}', "no checkpoint"),
-        ('{"format": 3, "state": {"x": {"__type__": "array", "name": "gone"}}}', "no checkpoint"),
-        ("[1", "no checkpoint"),
-        ("[]", "no checkpoint"),
-        (None, "no checkpoint"),
+        ('{"state": {}}', "not a checkpoint"),
+        ('{"format": 3, "state": {"x": {"__type__": "array", "name": "gone"}}}', "not a checkpoint"),
+        ("[1", "not a checkpoint"),
+        ("[]", "not a checkpoint"),
+        (None, "not a checkpoint"),
     ],
 )
 def test_other_content_is_refused(tmp_path, text, message):
