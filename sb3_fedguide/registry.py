@@ -1,4 +1,4 @@
-"""The one table of algorithms: class, server, arguments and settings. Looking one up imports it; listing imports nothing."""
+"""The one table of algorithms: class, server, arguments and settings. A look-up imports the algorithm."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 class Entry(NamedTuple):
     """An algorithm.
 
-    :param module: where its class is
+    :param module: of its class
     :param cls: the class's name
     :param server: ``"module:name"`` of its server's :class:`~sb3_fedguide.server.methods.Method`; ``None`` for that of its
         base class
-    :param arguments: ``"module:name"`` of the dataclass that its constructor takes, where that is known without the class;
-        nothing then needs PyTorch to check a configuration
-    :param settings: its YAML file; ``None`` for ``<name>.yml`` in ``zoo_configs``, or else that of the nearest base class
+    :param arguments: ``"module:name"`` of the dataclass that its constructor takes, if it is known without the class;
+        a configuration is then checked without PyTorch
+    :param settings: its YAML file; ``None`` for ``<name>.yml`` in ``zoo_configs``, or that of the nearest base class
     """
 
     module: str
@@ -52,14 +52,14 @@ ALGORITHMS: dict[str, Entry] = {
 
 
 def register_algorithm(name: str, entry_point: str, server: str | None = None, settings: str | Path | None = None) -> None:
-    """Make an algorithm of one's own known by name, on the command line too (``--gym-packages``).
+    """Register your own algorithm under a name, also for the command line (``--gym-packages``).
 
-    :param name: what ``--algo`` takes
+    :param name: for ``--algo``
     :param entry_point: ``"module:Class"``, imported when it is first used
-    :param server: ``"module:name"`` of its :class:`~sb3_fedguide.server.methods.Method`, which a server imports and may do
-        without PyTorch; without it, the nearest base class's
-    :param settings: YAML file with its hyperparameters; without it, those of the nearest base class
-    :raises ValueError: for a name that means something else already
+    :param server: ``"module:name"`` of its :class:`~sb3_fedguide.server.methods.Method`, which a server
+        imports, if possible without PyTorch; by default the nearest base class's
+    :param settings: YAML file with its hyperparameters; by default those of the nearest base class
+    :raises ValueError: for a name that is already taken
     """
     for what, value in (("entry_point", entry_point), ("server", server)):
         if value is not None and not all(value.partition(":")):

@@ -1,4 +1,4 @@
-"""What each random stream of a federation is for. A stream's key is ``(role, client_id, ...)``."""
+"""The purpose of each random stream of a federation. A stream's key is ``(role, client_id, ...)``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EVALUATION_SEED = 20_000
 
 
 class Role(IntEnum):
-    """First part of a stream's key; the numbers are part of what a seed means, so they never change."""
+    """First part of a stream's key. The numbers never change, since the meaning of a seed depends on them."""
 
     TRAIN_ENV = 0
     EVAL_ENV = 1

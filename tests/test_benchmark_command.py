@@ -144,7 +144,7 @@ def test_an_interrupt_lets_runs_end_and_keeps_what_is_finished(quick, signals, t
     assert quick("--algos", "local", "--seeds", "0", "1", "2", "3", "--processes", "2", **behaviour) == 130
     assert [line.split()[0] for line in starts(tmp_path)] == ["local-seed0", "local-seed1", "local-seed2"]
     captured = capfd.readouterr()
-    assert "interrupted; 3 runs are not finished, and the same command goes on with them" in captured.err
+    assert "interrupted; 3 runs are not finished; the same command resumes them" in captured.err
     assert "failed" not in captured.err and "local" in captured.out
     assert quick("--algos", "local", "--seeds", "0", "1", "2", "3") == 0
     assert starts(tmp_path) == ["local-seed1 resumed 1", "local-seed2 resumed 1", "local-seed3 new 1"]

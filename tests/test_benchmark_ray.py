@@ -143,5 +143,5 @@ def test_interrupts_end_runs_with_a_checkpoint(cluster):
         time.sleep(0.05)
     os.kill(process.pid, signal.SIGTERM)
     code, _, errors = finished(process)
-    assert code == 143 and "1 runs are not finished, and the same command goes on with them" in errors, errors
+    assert code == 143 and "1 runs are not finished; the same command resumes them" in errors, errors
     assert "which is complete" in (runs / "output.txt").read_text()

@@ -341,7 +341,7 @@ def test_a_run_on_a_disk_that_fills_up_says_so(limit, tmp_path):
     code, error = in_a_process_with_small_files(limit, lambda: main([*QUICK, "-f", str(tmp_path), *SMALL]))
     assert code == 1, error
     (line,) = error.splitlines()
-    assert line.startswith("train.py: error: ") and "File too large" in line and line.endswith("what was written before stays")
+    assert line.startswith("train.py: error: ") and "File too large" in line and line.endswith("earlier files stay")
     folder = tmp_path / "local" / "Bandit2D_1"
     assert not [path for path in folder.rglob("*") if path.name.startswith(".")]
     if (folder / "metadata.json").exists():
@@ -356,7 +356,4 @@ def test_a_log_folder_that_becomes_read_only_says_so(tmp_path, monkeypatch, caps
 
     monkeypatch.setattr(Path, "mkdir", refuse)
     assert main([*QUICK, "-f", str(tmp_path / "logs"), *SMALL]) == 1
-    assert (
-        capsys.readouterr().err
-        == f"train.py: error: {tmp_path / 'logs'}: Read-only file system; what was written before stays\n"
-    )
+    assert capsys.readouterr().err == f"train.py: error: {tmp_path / 'logs'}: Read-only file system; earlier files stay\n"

@@ -96,7 +96,7 @@ def test_a_damaged_newest_one_falls_back_with_a_warning(tmp_path, damage):
     write_checkpoint(tmp_path, 1, {**STATE, "round": 1})
     newest = write_checkpoint(tmp_path, 2, {**STATE, "round": 2})
     newest.write_bytes(DAMAGES[damage](newest.read_bytes()))
-    with pytest.warns(UserWarning, match=r"round_000002\.npz is damaged.*going on from the one before it, round_000001\.npz"):
+    with pytest.warns(UserWarning, match=r"round_000002\.npz is damaged.*resuming from the one before it, round_000001\.npz"):
         path, state = newest_checkpoint(tmp_path)
     assert path.name == "round_000001.npz" and state["round"] == 1
     path.write_bytes(b"")
@@ -141,12 +141,12 @@ def test_a_crafted_file_executes_nothing(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"format": 2, "state": {}}', "format 2 and this version reads 3: go on with the version of the package"),
-        ('{"state": {}}', "no checkpoint"),
-        ('{"format": 3, "state": {"x": {"__type__": "array", "name": "gone"}}}', "no checkpoint"),
-        ("[1", "no checkpoint"),
-        ("[]", "no checkpoint"),
-        (None, "no checkpoint"),
+        ('{"format": 2, "state": {}}', "format 2 and this version reads 3: resume it with the version of the package"),
+        ('{"state": {}}', "not a checkpoint"),
+        ('{"format": 3, "state": {"x": {"__type__": "array", "name": "gone"}}}', "not a checkpoint"),
+        ("[1", "not a checkpoint"),
+        ("[]", "not a checkpoint"),
+        (None, "not a checkpoint"),
     ],
 )
 def test_other_content_is_refused(tmp_path, text, message):

@@ -65,7 +65,7 @@ def test_pictures_of_every_client(tmp_path):
     [
         (["{folder}/nothing"], "it has no summary.json"),
         (["{run}", "--episodes", "0"], "--episodes must be at least 1"),
-        (["{run}", "--policy", "broadcast"], "no broadcast one"),
+        (["{run}", "--policy", "broadcast"], "no broadcast policy"),
         (["{run}", "-o", "{folder}/missing/result.json"], "there is no folder"),
         (["{damaged}"], "parameters.npz is damaged"),
     ],

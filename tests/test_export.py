@@ -216,7 +216,7 @@ def test_a_file_of_ddpg_policies(point_envs, tmp_path):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["{folder}/nothing"], "is no folder of a run or of a deployed client"),
+        (["{folder}/nothing"], "is not a folder of a run or of a deployed client"),
         (["{run}", "--clients", "9"], "there is no client 9"),
         (["{folder}/early"], "a client writes it after the federation's last round"),
         (["{folder}/damaged"], "is damaged"),

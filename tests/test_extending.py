@@ -107,7 +107,7 @@ def test_fedguide_trains_in_the_example_world(tmp_path, capsys):
     with pytest.raises(SystemExit):
         evaluate([str(tmp_path / "fedguide" / "Wind_1")])
     error = capsys.readouterr().err
-    assert "must be one of" in error and "trained with --gym-packages wind_world: give that here as well" in error
+    assert "must be one of" in error and "trained with --gym-packages wind_world: give it here as well" in error
 
 
 def test_taken_names_of_worlds_and_families_are_refused(tmp_path):

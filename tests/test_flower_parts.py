@@ -58,8 +58,8 @@ WRONG = [
     ("server", {"params": {"eta": "high"}}, "eta"),
     ("server", {"params": {"learnin_rate": 1}}, "Did you mean 'learning_rate'"),
     ("server", {"params": {"gamma": 2}}, "gamma=2 must be between 0 and 1"),
-    ("server", {"listen": "9443"}, "no address"),
-    ("server", {"listen": "0.0.0.0:94430"}, "no address"),
+    ("server", {"listen": "9443"}, "not an address"),
+    ("server", {"listen": "0.0.0.0:94430"}, "not an address"),
     ("server", {"certificates": "nowhere"}, "fedguide deploy certificates"),
     ("server", {"clients": {0: "a.pub", 1: "a.pub"}}, "same key"),
     ("server", {"clients": {1: "a.pub", 2: "b.pub"}}, "numbered from 0"),
@@ -71,7 +71,7 @@ WRONG = [
     ("client", {"sever": "localhost:9443"}, "sever"),
     ("client", {"env": "HoperHard"}, "Did you mean 'HopperHard'"),
     ("client", {"client": 4}, "4"),
-    ("client", {"server": "localhost"}, "no address"),
+    ("client", {"server": "localhost"}, "not an address"),
     ("client", {"ca": "nowhere"}, "there is no file"),
     ("client", {"key": "nowhere"}, "fedguide deploy key"),
     ("client", {"key": "a.pub"}, "others can read"),
@@ -212,7 +212,7 @@ def test_a_client_that_has_finished_ends_at_once(
     (folder / "finished").touch()
     assert command() == 0
     said = capsys.readouterr()
-    assert "the federation has had its last round; a new one needs a folder other than" in said.out
+    assert "the federation has finished its last round; a new one needs a folder other than" in said.out
     assert "does not answer" not in said.out
     assert command(seed=1) == 2
     assert "is of another run: its seed is 0, here 1" in capsys.readouterr().err

@@ -92,7 +92,7 @@ def test_what_only_rounds_give_is_left_out_of_files_until_it_is_there(tmp_path):
     trained.learn(16 * 4)
     trained.import_parameters(tmp_path / "parameters.npz")
     assert_holds_the_same(model, trained)
-    with pytest.raises(ValueError, match="the file holds scales, which this method has not with its settings"):
+    with pytest.raises(ValueError, match="the file holds scales, which this method does not have with its settings"):
         FedAvg("MlpPolicy", "Bandit2D", **SMALL).import_parameters(tmp_path / "parameters.npz")
 
 

@@ -187,7 +187,7 @@ def test_private_is_private_or_nothing_is_sent(service, run, capsys):
     assert main(["push", str(run), "me/hidden", "--private"]) == 0
     assert service.private == {"me/hidden"}
     service.repositories["me/open"] = {}
-    assert "is there already and not private" in refused(["push", str(run), "me/open", "--private"], capsys)
+    assert "exists already and is not private" in refused(["push", str(run), "me/open", "--private"], capsys)
     assert service.repositories["me/open"] == {}
 
 
@@ -204,13 +204,13 @@ def test_the_folder_of_a_data_set_stays_here(service, run, tmp_path):
     ("argv", "message"),
     [
         ("push {run}/nothing me/bandit", "is not the folder of a trained run: it has no summary.json"),
-        ("push {run} bandit", "'bandit' is no repository of the hub: give OWNER/NAME"),
-        ("push {run} ../../x", "is no repository of the hub"),
+        ("push {run} bandit", "'bandit' is not a repository of the hub: give OWNER/NAME"),
+        ("push {run} ../../x", "is not a repository of the hub"),
         ("push {run} me/bandit -m ''", "the message is empty"),
         ("push {run} others/bandit", "(403): You don't have the rights to create a model under this namespace; log in with"),
         ("pull me/nothing -f {logs}", "there is no repository me/nothing on http://127.0.0.1"),
         ("pull me/run -f {logs} --revision v9", "me/run has no revision v9"),
-        ("pull me/../run -f {logs}", "is no repository of the hub"),
+        ("pull me/../run -f {logs}", "is not a repository of the hub"),
         ("pull me/run -f {run}/summary.json", "cannot be made"),
         ("pull me/run -f {logs} --gym-packages no_such_module", "--gym-packages no_such_module"),
     ],
@@ -230,7 +230,7 @@ def test_without_a_token_nothing_is_sent(service, run, shared, monkeypatch, tmp_
     assert main(["pull", "me/run", "-f", str(tmp_path)]) == 0  # what is public needs none
     capsys.readouterr()
     service.private.add("me/run")
-    assert "or it is a private one that you may not see" in refused(["pull", "me/run", "-f", str(tmp_path)], capsys)
+    assert "or it is private and you have no access" in refused(["pull", "me/run", "-f", str(tmp_path)], capsys)
     monkeypatch.setenv("HF_TOKEN", "hf_wrong")
     assert "(401)" in refused(["push", str(run), "me/bandit"], capsys)
 
@@ -331,7 +331,7 @@ HOSTILE = {
     "keyword arguments": "keyword argument '/etc/passwd', which may name a file or a module",
     "unknown argument": "me/run/metadata.json: client 0: the function that makes its environment raised TypeError",
     "module": "no environment 'this:Ant-v5' is registered",
-    "missing": "me/run is no run that 'fedguide push' sent: it has no parameters.npz",
+    "missing": "me/run is not a run from 'fedguide push': it has no parameters.npz",
 }
 
 
@@ -358,11 +358,11 @@ def test_names_that_lead_elsewhere_and_other_files_are_left_alone(service, share
 def test_sizes_are_bounded_before_and_while_a_file_comes(service, shared, monkeypatch, tmp_path, capsys):
     pulling = ["pull", "me/run", "-f", str(tmp_path / "logs")]
     service.said_sizes["deployed.npz"] = 10**15
-    assert "deployed.npz of me/run has 1000000000000000 bytes; at most 256000000 are taken" in refused(pulling, capsys)
+    assert "deployed.npz of me/run has 1000000000000000 bytes; the limit is 256000000" in refused(pulling, capsys)
     assert not any(path.endswith("deployed.npz") for method, path in service.requests)
     service.said_sizes = {"versions.json": 10}
     shared["versions.json"] = b" " * (hub.FILES["versions.json"] + pull.CHUNK)
-    assert "versions.json of me/run is longer than the 100000 bytes that are taken" in refused(pulling, capsys)
+    assert "versions.json of me/run is longer than the limit of 100000 bytes" in refused(pulling, capsys)
     assert_nothing_stays(tmp_path / "logs")
 
 

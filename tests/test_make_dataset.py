@@ -114,7 +114,7 @@ def test_logs_that_do_not_fit_name_file_and_column(tmp_path, capsys):
         assert message in error and len(error.splitlines()) == 1
     with pytest.raises(SystemExit):
         fedguide(["dataset", "x-v0", str(tmp_path / "c.csv")])
-    assert "say what actions the client takes: --env ID, or --action-low" in capsys.readouterr().err
+    assert "give the client's action space: --env ID, or --action-low" in capsys.readouterr().err
     log = read_log([tmp_path / "c.csv", tmp_path / "c.csv"])
     assert log["terminations"].tolist() == [0, 1, 0, 1] and log["truncations"].tolist() == [0, 1, 0, 1]
 

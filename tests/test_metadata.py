@@ -268,7 +268,7 @@ def test_files_that_are_not_metadata(tmp_path):
     with pytest.raises(ValueError, match=r"bad\.json is not valid JSON"):
         load_family(path)
     path.write_text(json.dumps(hopper_hard()).replace('"world"', '"backbone": "Hopper-v5", "world"', 1))
-    with pytest.raises(ValueError, match="'backbone' stands twice"):
+    with pytest.raises(ValueError, match="'backbone' is given twice"):
         load_family(path)
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match="cannot read"):

@@ -105,7 +105,7 @@ def test_run_folders_are_drawn_finished_or_not(tmp_path, capfd):
         == 0
     )
     assert is_picture(out / "curves-clients-steps-Bandit2D.png") and is_picture(out / "bars.png")
-    assert f"{folders[1]} is not finished, and is drawn in learning curves only" in capfd.readouterr().err
+    assert f"{folders[1]} is not finished, and is drawn only in learning curves" in capfd.readouterr().err
     assert main(["plot", *map(str, folders), "-x", "seconds", "-o", str(out)]) == 2
     assert f"curves: {folders[1]} does not say the seconds" in capfd.readouterr().err
 

@@ -72,7 +72,7 @@ def test_callbacks_of_the_run_have_to_be_there(tmp_path):
     train(make("local", "Bandit2D"), STOP, tmp_path / "parts.csv", tmp_path)
     resumed = make("local", "Bandit2D").resume(tmp_path)
     with pytest.raises(
-        ValueError, match="callbacks that this run has not got: RunEvalCallback, CostCallback, DeployedCallback"
+        ValueError, match="callbacks that this run does not have: RunEvalCallback, CostCallback, DeployedCallback"
     ):
         resumed.learn(256, reset_num_timesteps=False)
     (tmp_path / "parts.csv").write_text("round\n")

@@ -108,7 +108,7 @@ def survive(driver: Driver, algo: str, env: str, tmp_path: Path, kills: list[lis
             argv = arguments(algo, env, parts, rounds)
             if folder.exists():
                 assert driver(["--resume", str(folder)], log) == 2
-                assert "is no folder of a run that can go on" in log.read_text()
+                assert "is not the folder of a run to resume" in log.read_text()
                 folder = folder.with_name(f"{env}_{int(folder.name.rsplit('_', 1)[1]) + 1}")
         else:
             argv = ["--resume", str(folder), "--verbose", "0"]
@@ -221,7 +221,7 @@ def command(*argv: str) -> int:
 
 
 CONTRADICTIONS = {
-    "--rounds 3": "the run in .* has had 4 rounds, so it cannot be one of 3",
+    "--rounds 3": "the run in .* has done 4 rounds, so its length cannot be 3",
     "-i elsewhere": "-i elsewhere: there is no .*elsewhere; give the folder of a trained run, or its parameters.npz",
     "--seed 1": "--seed 1 contradicts the run in .*, whose own is 0",
     "--algo fedavg": "--algo fedavg contradicts the run in .*, whose own is local",
@@ -248,7 +248,7 @@ def test_flags_that_agree_or_are_free_are_taken(stopped, tmp_path, capsys, monke
     flags = ["--algo", "local", "--rounds", "6", "--seed", "0", "--save-freq", "1", "--verbose", "1", "--cache-dir", "other"]
     assert command("--resume", "run", *flags) == 0
     captured = capsys.readouterr()
-    assert "writing to run, going on after round 4" in captured.out and captured.err == ""
+    assert "writing to run, resuming after round 4" in captured.out and captured.err == ""
     assert [path.name for path in checkpoints(folder / "checkpoints")] == ["round_000005.npz", "round_000006.npz"]
     lines = (folder / "command.txt").read_text().splitlines()
     assert len(lines) == 2 and "--resume run" in lines[1]
@@ -257,7 +257,7 @@ def test_flags_that_agree_or_are_free_are_taken(stopped, tmp_path, capsys, monke
     assert not (tmp_path / "other").exists()
     content = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert command("--resume", "run") == 0  # and once more
-    assert "the run in run is finished: it had its 6 rounds" in capsys.readouterr().out
+    assert "the run in run is finished: it has done its 6 rounds" in capsys.readouterr().out
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == content
 
 
@@ -277,12 +277,12 @@ def test_a_finished_run_goes_on_for_longer(driver, tmp_path, capsys):
     assert yaml.safe_load((folder / "args.yml").read_text())["rounds"] == 7
     capsys.readouterr()
     assert command("--resume", str(folder), "-n", str(7 * 4 * 64)) == 0
-    assert "is finished: it had its 7 rounds" in capsys.readouterr().out
+    assert "is finished: it has done its 7 rounds" in capsys.readouterr().out
     assert command("--resume", str(folder), "--rounds", "6") == 2
-    assert "has had 7 rounds, so it cannot be one of 6" in capsys.readouterr().err
+    assert "has done 7 rounds, so its length cannot be 6" in capsys.readouterr().err
     shutil.rmtree(folder / "checkpoints")
     assert command("--resume", str(folder), "--rounds", "8") == 2
-    assert f"no checkpoint to go on from; start a new run from what it has learned with -i {folder}" in capsys.readouterr().err
+    assert f"no checkpoint to resume from; start a new run from its parameters with -i {folder}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("algo", ["fedavg", pytest.param("fedguide", marks=pytest.mark.slow)])
@@ -312,7 +312,7 @@ def test_a_damaged_newest_checkpoint_is_named_and_the_one_before_it_used(stopped
     second.write_bytes(content[: len(content) // 2])
     assert command("--resume", str(folder)) == 0
     error = capsys.readouterr().err
-    assert re.fullmatch(r"train\.py: warning: .*round_000004\.npz is damaged.*going on from .*round_000002\.npz\n", error), (
+    assert re.fullmatch(r"train\.py: warning: .*round_000004\.npz is damaged.*resuming from .*round_000002\.npz\n", error), (
         error
     )
     assert same(freeze(results(folder)), freeze(results(tmp_path / "local" / "Bandit2D_1")))
@@ -360,7 +360,7 @@ def test_damaged_run_folders_are_refused(name, stopped, tmp_path, capsys):
     assert command("--resume", str(folder)) == 2
     assert f"has no {name}" in capsys.readouterr().err
     assert command("--resume", str(tmp_path / "nowhere")) == 2
-    assert "is no folder of a run that can go on" in capsys.readouterr().err
+    assert "is not the folder of a run to resume" in capsys.readouterr().err
 
 
 def test_one_process_at_a_time(stopped, capsys):

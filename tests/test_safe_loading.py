@@ -171,7 +171,7 @@ def changed(path: Path, folder: Path, header: dict | None = None, arrays: dict |
 @pytest.mark.parametrize(
     ("header", "arrays", "message"),
     [
-        ({"format": "another"}, {}, "its header is missing or another one"),
+        ({"format": "another"}, {}, "its header is missing or different"),
         ({"version": 2}, {}, "has version 2 of the format; this program reads version 1"),
         ({"parts": "prior"}, {}, "does not say which parts"),
         ({"pretrained": 1}, {}, "does not say which parts"),

@@ -249,9 +249,9 @@ def test_the_offline_stage_of_a_bandit_has_a_thousand_rows_and_no_trunk():
 
 WRONG = {
     "metods: {local: }": "unknown key in the study: 'metods'. Did you mean 'methods'?",
-    "methods: {}": "a study says at least its methods and families",
+    "methods: {}": "a study has at least methods and families",
     "methods: {fedgiude: }\nfamilies: [Bandit2D]": "unknown algorithm 'fedgiude'. Did you mean 'fedguide'?",
-    "methods: {fedavg (old): }\nfamilies: [Bandit2D]": "does not say its algorithm; give it algo: fedavg",
+    "methods: {fedavg (old): }\nfamilies: [Bandit2D]": "has no algorithm; give it algo: fedavg",
     "methods: {local: {parms: {}}}\nfamilies: [Bandit2D]": "unknown key in method 'local': 'parms'. Did you mean 'params'?",
     "methods: {local: }\nfamilies: [Bandit3D]": "unknown environment 'Bandit3D'. Did you mean 'Bandit2D'?",
     "methods: {local: }": "families is missing",
@@ -272,8 +272,8 @@ WRONG = {
     "methods: {local: }\nfamilies: [Bandit2D]\nparams: {policy_kwargs: {net_arch: !!set {8}}}": "kwargs.net_arch must",
     "methods: {local: {delays: asink}}\nfamilies: [Bandit2D]": "--delays asink",
     "methods: {local: , mine: {algo: local}}\nfamilies: [Bandit2D]": "'local' and 'mine' are both local with the label",
-    "methods: {local: , local: }": "the key 'local' stands twice",
-    "[1, 2]": "a study says at least",
+    "methods: {local: , local: }": "the key 'local' is given twice",
+    "[1, 2]": "a study has at least",
 }  # fmt: skip
 
 
@@ -288,14 +288,14 @@ def test_a_wrong_file_is_one_message_and_nothing_on_disk(text, tmp_path, monkeyp
 
 
 FLAGS = {
-    "-params n_epochs:1": "-params is said in the file of a study",
-    "--label x": "--label is said in the file of a study",
+    "-params n_epochs:1": "the study's file sets -params",
+    "--label x": "the study's file sets --label",
     "--envs HopperHard": "unknown family of the study: 'HopperHard'",
     "--algos fedkl": "unknown method of the study: 'fedkl'",
-    "--seeds 7": "no run of the study is left by --seeds; give",
-    "--algos fedavg --seeds 1": "no run of the study is left by --algos with --seeds; give",
-    "--algos local --envs Reacher": "no run of the study is left by --algos with --envs; give",
-    "--algos local --envs Reacher --table-only": "no run of the study is left by --algos with --envs; give",
+    "--seeds 7": "--seeds leaves no run of the study; give",
+    "--algos fedavg --seeds 1": "--algos with --seeds leaves no run of the study; give",
+    "--algos local --envs Reacher": "--algos with --envs leaves no run of the study; give",
+    "--algos local --envs Reacher --table-only": "--algos with --envs leaves no run of the study; give",
     "--table-only": "has no results of Bandit2D",
     "--table-only --dry-run": "contradict each other",
 }

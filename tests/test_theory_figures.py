@@ -148,7 +148,7 @@ def test_the_command_draws_them_from_folders(tmp_path, monkeypatch):
     [
         ("lemma2", "local", THEOREM, {}, "it has no V_phi"),
         ("theorem3", "local", LEMMA, {}, "train it with --eval-average"),
-        ("theorem3", "fedavg", THEOREM, {"server_step": 2.0}, "has server_step 2.0: what its server sends is not the average"),
+        ("theorem3", "fedavg", THEOREM, {"server_step": 2.0}, "has server_step 2.0: its server does not send the average"),
         ("theorem3", "fedguide-r", THEOREM, {"server_step": 1.0, "screening": 0.05}, "has screening 0.05"),
     ],
 )

@@ -104,7 +104,7 @@ def test_without_the_package_one_line_says_what_to_install(name, tmp_path, capfd
     {
         "--track mlflow": "invalid choice",
         "--track-project x": "is for --track trackio",
-        "--track wandb --track-project a/b": "is no name",
+        "--track wandb --track-project a/b": "is not a name",
     }.items(),
 )
 def test_what_is_wrong_is_one_line(flags, reason, tmp_path, capfd):

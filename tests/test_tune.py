@@ -155,7 +155,7 @@ def test_an_interrupted_trial_goes_on_where_it_was(quick, tmp_path, capfd, reque
     threading.Thread(target=interrupt, daemon=True).start()
     assert quick("--sampler", "grid", "--n-trials", "2", behaviour="wait") == 128 + number
     assert starts(tmp_path) == ["trial-0 0 0.1 new"]
-    assert "the same command goes on" in capfd.readouterr().err
+    assert "the same command resumes" in capfd.readouterr().err
     assert [trial.state.name for trial in study().trials] == ["RUNNING"]
     assert quick("--sampler", "grid", "--n-trials", "2") == 0
     assert starts(tmp_path) == ["trial-0 0 0.1 resumed", "trial-1 0 0.2 new"]
@@ -182,7 +182,7 @@ WRONG = {
     "--seeds 1 1": "--seeds names 1 twice",
     "--seeds -1": "--seeds must not be negative",
     "--processes 0": "--processes must be at least 1",
-    "--study-name a/b": "to be the name of a folder",
+    "--study-name a/b": "also the name of a folder",
     "--search nowhere.yml": "there is no file nowhere.yml",
     "--sampler best": "invalid choice",
     "mu: [0.1, -1]": "mu=-1 must be at least 0",

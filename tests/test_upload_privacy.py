@@ -359,5 +359,5 @@ def test_the_command_line_says_what_is_missing_and_what_was_spent(tmp_path, monk
     monkeypatch.setattr(importlib.util, "find_spec", lambda module: None if module == "opacus" else find(module))
     assert main(run) == 2
     error = capfd.readouterr().err
-    assert error.endswith("noise_multiplier needs Opacus, which says what epsilon is: pip install 'sb3-fedguide[privacy]'\n")
+    assert error.endswith("noise_multiplier needs Opacus, which computes epsilon: pip install 'sb3-fedguide[privacy]'\n")
     assert len(error.splitlines()) == 1

@@ -6,7 +6,7 @@ from sb3_fedguide import FedAvg, register_algorithm
 
 
 class HalfAveraging(FedAvg):
-    """FedAvg whose clients keep half of what is their own."""
+    """FedAvg whose clients keep half of their own parameters."""
 
     def receive(self, index, broadcast):
         own = self.policy.client_state_dict(index)

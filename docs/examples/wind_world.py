@@ -46,7 +46,7 @@ class WindEnv(ClientEnv[WindClient]):
 
     @classmethod
     def scripted_policy(cls, family, client):
-        """What makes the offline data: fly back, with some noise."""
+        """Policy that collects the offline data: it flies back, with some noise."""
         return lambda obs, rng: np.tanh(-3 * obs + 0.3 * rng.standard_normal(obs.shape)).astype(np.float32)
 
 

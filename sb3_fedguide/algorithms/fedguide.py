@@ -25,7 +25,7 @@ from sb3_fedguide.settings.arguments import FederatedPPOArguments, FedGuideAArgu
 from sb3_fedguide.settings.signatures import takes
 from sb3_fedguide.state.held import Held
 
-#: Raw actions further outside the action box than this get no importance weight: no behaviour data can lie there.
+#: Raw actions that lie further outside the action box get no importance weight: behaviour data cannot lie there.
 ACTION_MARGIN = 0.1
 
 
@@ -34,11 +34,11 @@ class FedGuide(FederatedPPO):
 
     Every client regularises PPO towards its personal prior, a mixture of diffusion priors (paper, Eq. 10),
     and computes advantages from a blend of its critic and a frozen DICE value (Eq. 12). Only the linear head of the
-    client's prior and its row of transport costs leave it. Round by round the loss is
+    client's prior and its row of transport costs leave the client. The loss of a round is
 
     ``L = PPO + vf_coef * MSE(V) + lambda_trust * KL(pi_old || pi) + lambda_prior(h) * R_prior``.
 
-    Paper: FedGuide (see ``docs/fedguide.md`` for where this implementation decides otherwise)
+    Paper: FedGuide (``docs/fedguide.md`` lists the differences of this implementation)
 
     :param lambda_trust: lambda_1, weight of the exact Gaussian trust-region term
     :param lambda_prior: lambda_2, weight of the prior term in the first round
@@ -57,7 +57,7 @@ class FedGuide(FederatedPPO):
     :param cost: transport cost, ``"score"`` or ``"param"`` (see :class:`~sb3_fedguide.server.ot_moe.OTMoE`)
     :param cost_scaling: ``"max"`` or ``"median"``
     :param adapt: ``"none"`` keeps the pretrained head; ``"advantage"`` refits it after each round on the offline data and
-        recent rollouts weighted by ``exp(A / adapt_temperature)``, so that what a client learns online reaches the others
+        recent rollouts weighted by ``exp(A / adapt_temperature)``, so that a client's online learning reaches the others
     :param adapt_temperature: temperature of these weights, in standard deviations of the advantage
     :param adapt_weight: share of the recent rollouts in the refit, in [0, 1]
 
@@ -81,7 +81,7 @@ class FedGuide(FederatedPPO):
     prior: Prior
     heads: np.ndarray  # psi_i, (n_clients, action_dim, p + 1)
     score_moments: np.ndarray  # S_i of the score cost, (n_clients, p + 1, p + 1); stay with their client
-    experts: np.ndarray  # what each client last received, (n_clients, n_experts, action_dim, p + 1); NaN before
+    experts: np.ndarray  # last received by each client, (n_clients, n_experts, action_dim, p + 1); NaN before
     mixture_rows: np.ndarray  # R_i, (n_clients, n_experts); NaN before the first plan
     dice: DiceValue | None = None
     dice_scale: np.ndarray | None = None  # (n_clients, 2): a and b of the calibration
@@ -128,7 +128,7 @@ class FedGuide(FederatedPPO):
                 self.hold(dice_scale=np.tile([1.0, 0.0], (n, 1)), calibrated=np.zeros(n, dtype=bool))
 
     def _no_experts(self, n_experts: int) -> tuple[np.ndarray, np.ndarray]:
-        """Experts and rows of clients that have received none."""
+        """Experts and rows of clients that have not yet received any."""
         shape = self.n_clients, n_experts
         return np.full((*shape, *self.prior.head_shape), np.nan, np.float32), np.full(shape, np.nan, np.float32)
 
@@ -140,7 +140,7 @@ class FedGuide(FederatedPPO):
         return payload
 
     def receive(self, index: int, broadcast: Payload) -> None:
-        if len(broadcast[EXPERTS]) != self.experts.shape[1]:  # a site does not know how many the server has
+        if len(broadcast[EXPERTS]) != self.experts.shape[1]:  # a site does not know the server's number of experts
             self.experts, self.mixture_rows = self._no_experts(len(broadcast[EXPERTS]))
         self.experts[index] = broadcast[EXPERTS]
         if MIXTURE_ROW in broadcast:

@@ -16,8 +16,8 @@ class FedKL(AnchoredFedAvg):
 
     ``pi_bar`` is the last broadcast policy and ``pi_old`` the policy at the start of the round, both at the client's own
     states; the divergences are exact, averaged over states. With an average after every round the two policies are the
-    same, and the weights add up; they differ where ``average_every > 1`` or after ``average_until``. Both weights zero
-    is FedAvg.
+    same, and the weights add up. The two policies differ if ``average_every > 1``, or after ``average_until``. With both
+    weights zero, FedKL is FedAvg.
 
     Weights and directions are those of the FedGuide paper's baseline. The original penalises ``sqrt(KL(pi_bar || pi))``
     and ``KL(pi_old || pi)``, minimises by SGD and adapts the weights.
@@ -26,7 +26,7 @@ class FedKL(AnchoredFedAvg):
 
     :param lambda_global: weight of the divergence from the broadcast policy
     :param lambda_local: weight of the divergence from the policy of the rollout
-    :raises ValueError: for negative weights, and where no policy is averaged
+    :raises ValueError: for negative weights, and if no policy is averaged
 
     All other parameters are those of :class:`FedAvg`.
     """
@@ -34,9 +34,7 @@ class FedKL(AnchoredFedAvg):
     @takes(FedKLArguments)
     def __init__(self, given: FedKLArguments) -> None:
         if given.average == "critic":
-            raise ValueError(
-                "FedKL stays near the broadcast policy, and average='critic' broadcasts none; use 'all' or 'actor'"
-            )
+            raise ValueError("FedKL needs a broadcast policy, and average='critic' broadcasts none; use 'all' or 'actor'")
         self.lambda_global = given.lambda_global
         self.lambda_local = given.lambda_local
         self._log_stds: dict[str, th.Tensor | None] = {}

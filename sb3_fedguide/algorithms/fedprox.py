@@ -15,7 +15,7 @@ from sb3_fedguide.settings.signatures import takes
 class AnchoredFedAvg(FedAvg):
     """FedAvg whose clients remember the last broadcast; the base class of methods that stay near it.
 
-    Before the first broadcast a client's anchor is what it starts its first round with. Parameters are those of
+    Before the first broadcast a client's anchor is its parameters at the start of its first round. Parameters are those of
     :class:`FedAvg`.
     """
 
@@ -40,7 +40,8 @@ class AnchoredFedAvg(FedAvg):
 class FedProx(AnchoredFedAvg):
     """FedAvg whose clients minimise ``L_PPO + mu / 2 * ||theta - theta_bar||^2``.
 
-    ``theta_bar`` is the last broadcast. The term covers what is averaged: actor (with ``log_std``) and critic by default.
+    ``theta_bar`` is the last broadcast. The term covers the averaged parameters: by default actor (with ``log_std``) and
+    critic.
     ``mu = 0`` is FedAvg.
 
     Paper: https://arxiv.org/abs/1812.06127 (Eq. 2)

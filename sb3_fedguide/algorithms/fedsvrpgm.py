@@ -18,36 +18,38 @@ from sb3_fedguide.settings.signatures import takes
 class FedSVRPGM(FedAvg):
     """FedAvg whose actors follow ``u = beta * g + (1 - beta) * (u_r + g - g_ref)`` instead of their gradient ``g``.
 
-    ``g`` is the ascent gradient of PPO's surrogate at the current policy and ``g_ref`` that of the same surrogate of the
-    same minibatch at the reference policy, with the ratio ``pi_ref / pi_old`` inside the clip; their difference has less
-    noise than ``g``. ``u_r`` is the average of all clients' directions in the round before, zero at first: each uploads
-    the mean of its ``u`` over the round's minibatches, before the norm is clipped. The critic keeps its own gradient,
+    ``g`` is the ascent gradient of PPO's surrogate at the current policy. ``g_ref`` is that of the same surrogate on the
+    same minibatch at the reference policy, with the ratio ``pi_ref / pi_old`` inside the clip. Their difference has less
+    noise than ``g``. ``u_r`` is the average of all clients' directions in the round before, zero at first: each client
+    uploads the mean of its ``u`` over the round's minibatches, before the norm is clipped. The critic keeps its own gradient,
     and ``max_grad_norm`` bounds both together. ``beta = 1`` is FedAvg; a reference equal to the current policy leaves
     ``beta * g + (1 - beta) * u_r``.
 
-    This is the practical form for PPO: the original takes one SGD step per trajectory, weighs ``g_ref`` by the importance
+    This is the practical form for PPO: the original takes one SGD step per trajectory, weights ``g_ref`` by the importance
     of the whole trajectory, and its reference is the broadcast before the last.
 
     Paper: https://arxiv.org/abs/2405.19499
 
     :param beta: weight of the plain gradient, in [0, 1]
-    :param reference_every: the reference policy becomes the client's policy at the start of every so many rounds, which
-        is the broadcast; in the first round, the policy that it starts with
-    :raises ValueError: for values out of range, and where no policy is averaged
+    :param reference_every: rounds between two reference policies; a new one is the client's policy at the start of the
+        round: the broadcast, or in the first round the initial policy
+    :raises ValueError: for values out of range, and if no policy is averaged
 
     All other parameters are those of :class:`FedAvg`.
     """
 
     state_attributes = ("reference", "reference_period", "momentum", "directions")
     reference: Parameters  # theta_ref of each client
-    reference_period: np.ndarray  # when each took it, counted in periods of `reference_every` rounds
+    reference_period: np.ndarray  # when each client took it, counted in periods of `reference_every` rounds
     momentum: Parameters  # u_r as each client last received it
     directions: Parameters  # each client's mean u of the last round
 
     @takes(FedSVRPGMArguments)
     def __init__(self, given: FedSVRPGMArguments) -> None:
         if given.average == "critic":
-            raise ValueError("FedSVRPG-M shares the actors' directions, and average='critic' no actor; use 'all' or 'actor'")
+            raise ValueError(
+                "FedSVRPG-M shares the actors' directions, and average='critic' shares no actor; use 'all' or 'actor'"
+            )
         self.beta = given.beta
         self.reference_every = given.reference_every
         self._reference_actor: StackedActor | None = None
@@ -61,7 +63,7 @@ class FedSVRPGM(FedAvg):
         actors = snapshot(self.policy, ACTOR_PREFIXES)
         zeros, more_zeros = ({name: np.zeros_like(array) for name, array in actors.items()} for _ in range(2))
         self.hold(reference=actors, reference_period=np.full(self.n_clients, -1), momentum=zeros, directions=more_zeros)
-        super()._setup_state()  # looks at what is uploaded
+        super()._setup_state()  # reads the names of uploaded parameters
 
     def upload(self, index: int) -> Payload:
         """Parameters and number of samples as in FedAvg, and ``direction.<actor parameter>``."""
@@ -89,7 +91,7 @@ class FedSVRPGM(FedAvg):
         self._record_ratios()
 
     def _refresh_references(self) -> None:
-        """Clients that were away when the others took a new reference take theirs when they are back."""
+        """Renew the references; a client that was absent when the others renewed theirs does so when it is back."""
         current = snapshot(self.policy, ACTOR_PREFIXES)
         period = self.round // self.reference_every
         due = (self.reference_period != period) | (self.round % self.reference_every == 0)
@@ -100,7 +102,7 @@ class FedSVRPGM(FedAvg):
 
     @th.no_grad()
     def _record_ratios(self) -> None:
-        """How far the reference has fallen behind: ``pi_ref / pi_old`` has mean one, but may come from few samples."""
+        """Staleness of the reference: ``pi_ref / pi_old`` has mean one, but few samples may dominate it."""
         buffer = self.rollout_buffer
         rows = [th.as_tensor(buffer.rows(array), device=self.device) for array in (buffer.observations, buffer.actions)]
         ratio = th.exp(self._at_reference(*rows)[0] - th.as_tensor(buffer.rows(buffer.log_probs), device=self.device))
@@ -117,12 +119,12 @@ class FedSVRPGM(FedAvg):
         return distribution.log_prob(mean, log_std, actions), distribution.entropy(mean, log_std)
 
     def _reference_gradients(self, data: FederatedSamples) -> dict[str, th.Tensor]:
-        """g_ref by parameter: the ascent gradient of what :meth:`train` maximises, at theta_ref."""
+        """g_ref by parameter: the ascent gradient of :meth:`train`'s objective, at theta_ref."""
         advantages = data.advantages
         if self.normalize_advantage and advantages.shape[1] > 1:
             centred = advantages - advantages.mean(dim=1, keepdim=True)
             advantages = centred / (advantages.std(dim=1, keepdim=True) + 1e-8)
-        # Actions come from pi_old, so E[ratio] = 1 however old the reference is: no cap beyond the surrogate's own.
+        # Actions come from pi_old, so E[ratio] = 1 for any age of the reference: no cap beyond the surrogate's own.
         log_prob, entropy = self._at_reference(data.observations, data.actions)
         ratio = th.exp(log_prob - data.old_log_prob)
         clip_range = self.clip_range(self._current_progress_remaining)

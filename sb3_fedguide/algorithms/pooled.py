@@ -1,4 +1,4 @@
-"""Pooled: one PPO on the data of all clients, the upper bound of what sharing can give. It is not federated."""
+"""Pooled: one PPO on the data of all clients, the upper bound for every method that shares. It is not federated."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from sb3_fedguide.offline.pretraining import Pretraining
 from sb3_fedguide.settings.arguments import FederatedPPOArguments
 from sb3_fedguide.settings.signatures import takes
 
-#: What a one-hot client vector as a further input of both networks is: a first-layer bias for each client.
+#: A one-hot client vector as an additional input of both networks: it equals a first-layer bias for each client.
 CLIENT_INPUT = ("mlp_extractor.policy_net.0.bias", "mlp_extractor.value_net.0.bias")
 
 
 class Pooled(FederatedPPO):
-    """PPO on the rollouts of all clients together, with one policy that sees which client it acts for.
+    """PPO on the rollouts of all clients together, with one policy whose input includes the client.
 
-    All clients' trajectories are in one place, which no federation allows: a control that says what is lost by keeping them
-    apart. A minibatch is ``batch_size`` rows of every client. The client vector is one-hot, and its weights are the clients'
-    own first-layer biases; all other parameters are one network's, so each client takes the mean of the clients' gradients.
+    All clients' trajectories are in one place, which no federation allows: as a control, it shows the loss from keeping them
+    separate. A minibatch is ``batch_size`` rows of every client. The client vector is one-hot, and its weights are the
+    clients' own first-layer biases; all other parameters are shared, so each client takes the mean of the clients' gradients.
 
     Parameters are those of :class:`FederatedPPO`.
 

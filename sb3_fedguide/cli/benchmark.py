@@ -1,4 +1,4 @@
-"""The benchmark command: methods, families and seeds as runs that can be interrupted, and tables of their results."""
+"""The benchmark command: methods, families and seeds as resumable runs, and tables of their results."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done.
+    """The work of a benchmark.
 
-    :param families: by name, in the order given
+    :param families: by name, in the given order
     :param rows: of the tables
-    :param runs: those without a result
-    :param configs: the settings of each of them
-    :param done: those that have theirs
-    :param results: with ``--table-only``, all that there are
-    :param study: that it is of
+    :param runs: runs without a result
+    :param configs: the settings of each of these runs
+    :param done: runs with a result
+    :param results: with ``--table-only``, all existing ones
+    :param study: the study that it belongs to
     """
 
     families: Mapping[str, Family]
@@ -63,7 +63,7 @@ class Plan:
 def main(argv: Sequence[str] | None = None, prog: str = "fedguide benchmark") -> int:
     """Run the command.
 
-    :return: the exit code: 0, 1 where a run failed or a file could not be written, 2 for wrong input, 130 after an interrupt
+    :return: the exit code: 0, 1 if a run failed or a file could not be written, 2 for wrong input, 130 after an interrupt
         (SIGINT), 143 after SIGTERM
     """
     arguments = parse_benchmark(argv, prog)
@@ -101,9 +101,9 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide benchmark") ->
 
 
 def prepare_benchmark(arguments: argparse.Namespace, prog: str) -> Plan:
-    """The plan, and Ray where it is to be used.
+    """Make the plan, and connect to Ray if it is used.
 
-    :raises ValueError: for anything that a user can put right
+    :raises ValueError: for anything that a user can correct
     """
     import_packages(arguments.gym_packages)
     if arguments.study is not None:
@@ -121,9 +121,9 @@ def prepare_benchmark(arguments: argparse.Namespace, prog: str) -> Plan:
 
 
 def make_plan(arguments: argparse.Namespace, prog: str) -> Plan:
-    """Check every run that is to be done; nothing is created. With ``--dry-run`` no algorithm is constructed for that.
+    """Check every missing run; nothing is created. With ``--dry-run`` this constructs no algorithm.
 
-    :raises ValueError: for anything that a user can put right
+    :raises ValueError: for anything that a user can correct
     """
     methods, flags = arguments.algos or list(ALGORITHMS), train_flags(arguments, SETTINGS + PASSED_ON + OF_RUNS)
     sources, families, rows = _sources(arguments), find_families(arguments, prog), asked_rows(arguments)
@@ -150,7 +150,7 @@ def make_plan(arguments: argparse.Namespace, prog: str) -> Plan:
                 configs.append(request.config)
                 missing.append(number)
     for number in () if arguments.dry_run else sorted(set(missing)):
-        prepare(checked[number][1], "")  # whether the settings fit the environments
+        prepare(checked[number][1], "")  # checks that the settings fit the environments
     return Plan(families, rows, runs, configs, done)
 
 
@@ -161,7 +161,7 @@ def _sources(arguments: argparse.Namespace) -> list[tuple[str, str]]:
 def find_families(arguments: argparse.Namespace, prog: str) -> dict[str, Family]:
     """The families of ``--envs`` and ``--metadata``, by name in the order given.
 
-    :raises ValueError: for one that is unknown, or is given twice
+    :raises ValueError: for a family that is unknown, or is given twice
     """
     families: dict[str, Family] = {}
     for source in _sources(arguments):
@@ -193,7 +193,7 @@ def _benchmark_run(arguments: argparse.Namespace, request: Request, seed: int, f
 
 
 def _check_earlier(run: BenchmarkRun, request: Request) -> None:
-    """:raises ValueError: if the run has been done, or begun, with other settings than those that are asked for"""
+    """:raises ValueError: if the run has been done, or begun, with other settings than the requested ones"""
     from sb3_fedguide.benchmark.results import read_result
     from sb3_fedguide.cli.benchmark_runs import interrupted_folder
     from sb3_fedguide.settings.config import read_yaml
@@ -217,12 +217,12 @@ def _check_earlier(run: BenchmarkRun, request: Request) -> None:
         return
     if changed := differences(before, now):
         raise ValueError(
-            f"{where} is of a run with other settings: {'; '.join(changed[:3])}; give another --label, or move that away"
+            f"{where} is of a run with other settings: {'; '.join(changed[:3])}; give another --label, or move it away"
         )
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any], prefix: str = "") -> list[str]:
-    """What both mappings have and have differently; one of them may be of another version, with more or fewer settings."""
+    """Entries with different values; one of the mappings may be of another version, with more or fewer settings."""
     found = []
     for name in before.keys() & now.keys():
         old, new = json.loads(json.dumps([before[name], now[name]]))  # tuples and lists are the same here
@@ -273,10 +273,10 @@ def _run(arguments: argparse.Namespace, plan: Plan) -> int:
             else:
                 run_here(plan.runs, arguments.processes or 1, signals, done, _say)
         except KeyboardInterrupt:
-            pass  # the second signal: the runs are ended, and the first one is in signals.received
+            pass  # the second signal: all runs have been killed, and signals.received has the first one
     unfinished = sum(not run.result.is_file() for run in plan.runs)
     if signals.received is not None:
-        _say(f"interrupted; {unfinished} runs are not finished, and the same command goes on with them")
+        _say(f"interrupted; {unfinished} runs are not finished; the same command resumes them")
         return signals.exit_code
     if failed:
         names = "; ".join(run.name for run in failed)

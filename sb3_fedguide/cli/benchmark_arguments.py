@@ -14,19 +14,19 @@ from sb3_fedguide.cli.arguments import OneLineParser, train_parser
 from sb3_fedguide.registry import ALGORITHMS
 from sb3_fedguide.settings.names import check_names
 
-#: Flags of the training command that say what a run computes, and that a run which goes on has in its own settings.
+#: Flags of the training command that determine a run's results; a resumed run has them in its own settings.
 SETTINGS = ("dataset", "rounds", "n_envs_per_client", "conf_file", "hyperparams")
 #: Other flags of the training command.
 PASSED_ON = ("gym_packages", "cache_dir", "eval_freq", "eval_episodes", "save_freq", "device")
-#: Those that only a benchmark takes, and that a run which goes on has in its own settings.
+#: Such flags that only a benchmark takes.
 OF_RUNS = ("delays", "eval_average")
-#: With ``--study``, what the study's file says instead.
+#: With ``--study``, the study's file sets these instead.
 OF_STUDY = (*SETTINGS, "delays", "metadata", "label", "eval_freq", "eval_episodes", "at_rounds", "baseline")
 ENGINES = ("local", "ray")
 FOLDER = "runs/benchmark"
-#: Method that others are compared with, where nothing else is said.
+#: Method that others are compared with, by default.
 BASELINE = "local"
-#: Rounds of the curve that tables show, where nothing else is said.
+#: Rounds of the learning curve that tables show, by default.
 AT_ROUNDS = (25, 50)
 #: Of tables in files.
 FORMATS = ("markdown", "latex", "json", "csv")
@@ -38,7 +38,7 @@ def benchmark_parser(prog: str) -> OneLineParser:
         prog=prog,
         allow_abbrev=False,
         description="Train methods on families with seeds, one result file per run, and print tables of the results. Runs "
-        "that have their result are not repeated, those that were interrupted go on. A study is all of this in a file.",
+        "with a result are not repeated, interrupted runs are resumed. A study describes all of this in a file.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     flag = parser.add_argument
@@ -46,25 +46,31 @@ def benchmark_parser(prog: str) -> OneLineParser:
          "--seeds then choose a part of it, and tables and figures are written to DIR/studies/NAME")  # fmt: skip
     flag("--algos", nargs="+", metavar="ALGO", help=f"methods; by default all: {', '.join(ALGORITHMS)}")
     flag("--envs", nargs="+", default=[], metavar="FAMILY", help="families of client environments, such as HopperHard")
-    flag("--metadata", nargs="+", default=[], metavar="FILE", help="metadata files of families of your own")
-    flag("--seeds", nargs="+", type=int, metavar="N", help="by default 0 1 2 3 4, and with --table-only all that there are")
+    flag("--metadata", nargs="+", default=[], metavar="FILE", help="metadata files of your own families")
+    flag(
+        "--seeds",
+        nargs="+",
+        type=int,
+        metavar="N",
+        help="random seeds; by default 0 1 2 3 4, and with --table-only all existing ones",
+    )
     for action in train_parser(prog)._actions:
         if action.dest in SETTINGS + PASSED_ON + OF_RUNS:
             parser._add_action(action)
-    flag("-f", "--folder", metavar="DIR", help=f"results are written to DIR/FAMILY-LABEL/ALGO-seedN.json, and runs keep "
-         f"what they need to go on in DIR/FAMILY-LABEL/runs; by default {FOLDER}, or that of the study")  # fmt: skip
+    flag("-f", "--folder", metavar="DIR", help=f"results are written to DIR/FAMILY-LABEL/ALGO-seedN.json, and "
+         f"checkpoints to DIR/FAMILY-LABEL/runs; by default {FOLDER}, or that of the study")  # fmt: skip
     flag("--label", help="name of the results; by default the configuration's")
     flag("--keep-runs", action="store_true", help="keep the folders of finished runs: models, TensorBoard events")
     flag(
         "--processes", type=int, metavar="K", help="runs at a time; by default 1, and with Ray as many as the cluster has CPUs"
     )
-    flag("--engine", default="local", choices=ENGINES, help="where runs are done: in processes here, or as tasks of Ray")
+    flag("--engine", default="local", choices=ENGINES, help="where runs are done: in local processes, or as tasks of Ray")
     flag("--address", "--ray-address", metavar="HOST:PORT", help="Ray cluster; by default "
-         "$RAY_ADDRESS, the one that runs here, or a new one")  # fmt: skip
-    flag("--table-only", action="store_true", help="do no runs, print what there is")
-    flag("--dry-run", action="store_true", help="do nothing; list the runs that are missing and estimate their CPU hours")
-    flag("--at-rounds", nargs="*", type=int, default=list(AT_ROUNDS), metavar="N", help="rounds of the curve that tables show")
-    flag("--baseline", default=BASELINE, metavar="ALGO", help="method whose mean return scores 1 where several families are "
+         "$RAY_ADDRESS, the cluster of this machine, or a new one")  # fmt: skip
+    flag("--table-only", action="store_true", help="do no runs, only print the tables of existing results")
+    flag("--dry-run", action="store_true", help="do no runs, only list the missing ones and estimate their CPU hours")
+    flag("--at-rounds", nargs="*", type=int, default=list(AT_ROUNDS), metavar="N", help="rounds of the learning curve to show")
+    flag("--baseline", default=BASELINE, metavar="ALGO", help="method whose mean return has score 1 if several families are "
          "aggregated")  # fmt: skip
     for name in FORMATS:
         flag(f"--{name}", nargs="?", const="-", metavar="FILE", help=f"write the tables as {name} to FILE, or to the terminal")
@@ -72,7 +78,7 @@ def benchmark_parser(prog: str) -> OneLineParser:
 
 
 def parse_benchmark(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
-    """Parse, and refuse what the flags alone show to be wrong."""
+    """Parse, and refuse errors that the flags alone show."""
     parser = benchmark_parser(prog)
     arguments = parser.parse_strictly(argv)
     try:
@@ -85,7 +91,7 @@ def parse_benchmark(argv: Sequence[str] | None, prog: str) -> argparse.Namespace
         arguments.folder = FOLDER
     arguments.label = arguments.label if arguments.label is not None else Path(arguments.conf_file).stem
     if not re.fullmatch(r"[\w.+=-]+", arguments.label):
-        parser.error(f"--label {arguments.label!r} is to be part of a folder's name: letters, digits and . _ + = - only")
+        parser.error(f"--label {arguments.label!r} becomes part of a folder's name: use only letters, digits and . _ + = -")
     return arguments
 
 
@@ -98,7 +104,7 @@ def _check(arguments: argparse.Namespace) -> None:
     if wrong := [value for value in arguments.at_rounds if value < 1]:
         raise ValueError(f"--at-rounds counts from 1, but got {wrong[0]}")
     if arguments.address is not None and arguments.engine != "ray":
-        raise ValueError("--address is that of a Ray cluster; give --engine ray as well")
+        raise ValueError("--address is the address of a Ray cluster; give --engine ray as well")
     if arguments.dry_run and arguments.table_only:
         raise ValueError("--dry-run and --table-only contradict each other; give one of them")
     for file in [file for name in FORMATS if (file := getattr(arguments, name)) not in (None, "-")]:
@@ -110,7 +116,7 @@ def _check_study(arguments: argparse.Namespace, parser: argparse.ArgumentParser)
     """:raises ValueError: for a flag whose meaning the study's file decides"""
     for action in parser._actions:
         if action.dest in OF_STUDY and getattr(arguments, action.dest) != action.default:
-            raise ValueError(f"{action.option_strings[0]} is said in the file of a study; leave it out, or --study")
+            raise ValueError(f"the study's file sets {action.option_strings[0]}; leave out the flag, or --study")
 
 
 def check_once(flag: str, values: Sequence[Any]) -> None:
@@ -120,15 +126,15 @@ def check_once(flag: str, values: Sequence[Any]) -> None:
 
 
 def check_seeds_and_processes(seeds: Sequence[int], processes: int | None) -> None:
-    """Of several runs.
+    """Check the seeds and processes of several runs.
 
-    :raises ValueError: for seeds that are negative or given twice, and for no process
+    :raises ValueError: for seeds that are negative or given twice, and for fewer than one process
     """
     check_once("--seeds", seeds)
     if processes is not None and processes < 1:
         raise ValueError(f"--processes must be at least 1, not {processes}")
     if negative := [seed for seed in seeds if seed < 0]:
-        raise ValueError(f"--seeds must not be negative, as {negative[0]} is: what is drawn at random cannot be gone on with")
+        raise ValueError(f"--seeds must not be negative, as {negative[0]} is: a run with a random seed cannot be resumed")
 
 
 def _reason(path: Path) -> str:
@@ -136,7 +142,7 @@ def _reason(path: Path) -> str:
 
 
 def check_methods(arguments: argparse.Namespace) -> None:
-    """Against those that are known once the user's own are registered.
+    """Check the methods, after the user's own are registered.
 
     :raises ValueError: for an unknown one
     """
@@ -145,12 +151,12 @@ def check_methods(arguments: argparse.Namespace) -> None:
 
 @functools.cache
 def _train_actions() -> Sequence[argparse.Action]:
-    """Of the training command, made once for the many runs of a study; nobody changes them."""
+    """Flags of the training command, made once for the many runs of a study, and never changed."""
     return tuple(train_parser("")._actions)
 
 
 def train_flags(arguments: argparse.Namespace, names: Sequence[str]) -> list[str]:
-    """The flags ``names`` for the training command, with the values that they have here."""
+    """The flags ``names`` for the training command, with their values here."""
     flags: list[str] = []
     for action in _train_actions():
         value = getattr(arguments, action.dest, None) if action.dest in names else None

@@ -1,4 +1,4 @@
-"""``fedguide benchmark --dry-run``: the runs that are missing, and what they will cost."""
+"""``fedguide benchmark --dry-run``: the missing runs, and their estimated cost."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
     from sb3_fedguide.cli.benchmark_tables import Row
 
 NOTE = (
-    "CPU hours of a quiet core, estimated from measured rounds (docs/performance.md); a busy machine takes two or three times "
+    "CPU hours of an idle core, estimated from measured rounds (docs/performance.md); a busy machine takes two or three times "
     "as long. The offline stage counts once for each family, seed and setting: its results are kept (--cache-dir)."
 )
 
 
 def costs_of(plan: Plan, eval_freq: int, n_episodes: int) -> list[Cost]:
-    """Of each missing run, in the plan's order."""
+    """The cost of each missing run, in the plan's order."""
     found = []
     for run, config in zip(plan.runs, plan.configs, strict=True):
         family, eval_average = plan.families[run.family], "--eval-average" in run.flags
@@ -27,7 +27,7 @@ def costs_of(plan: Plan, eval_freq: int, n_episodes: int) -> list[Cost]:
 
 
 def offline_seconds(plan: Plan, costs: list[Cost]) -> dict[tuple[str, str], float]:
-    """Family and piece of the offline stage to the seconds of one."""
+    """Family and piece of the offline stage to the seconds of one such piece."""
     return {
         (run.family, key): seconds for run, cost in zip(plan.runs, costs, strict=True) for key, seconds in cost.offline.items()
     }
@@ -65,7 +65,7 @@ def _row(*cells: object) -> Row:
 
 
 def print_costs(plan: Plan, eval_freq: int, n_episodes: int) -> None:
-    """On the terminal."""
+    """Print the costs on the terminal."""
     from sb3_fedguide.cli.benchmark_tables import print_rows
 
     print_rows(

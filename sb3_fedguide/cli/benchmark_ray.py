@@ -14,7 +14,7 @@ from sb3_fedguide.cli.signals import StopSignals
 def connect(address: str | None) -> None:
     """Join a cluster, or start one on this machine.
 
-    :param address: of the cluster; by default ``$RAY_ADDRESS``, the one that runs here, or a new one
+    :param address: of the cluster; by default ``$RAY_ADDRESS``, the cluster of this machine, or a new one
     :raises ValueError: if Ray is not installed, or the cluster cannot be joined
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -36,13 +36,13 @@ def run_on_ray(
 ) -> None:
     """Do the runs as tasks of the cluster that :func:`connect` has joined, one CPU each, spread over its machines.
 
-    :param n_at_once: so many at a time; by default as many as the cluster has CPUs
-    :param signals: after the first signal, nothing is begun and what runs ends after its round; at the second, all are killed
+    :param n_at_once: runs at a time; by default as many as the cluster has CPUs
+    :param signals: after the first signal, no run begins and the others end after their round; at the second, all are killed
     :param done: called for each run that ends
     """
     import ray
 
-    # A task is not tried again by Ray: a run that has failed is reported, and goes on when the user says so.
+    # Ray does not retry a task: a failed run is reported, and the user resumes it.
     task: Any = ray.remote(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")(execute)
     waiting, running, cancelled = deque(runs), dict[Any, BenchmarkRun](), False
     n_at_once = n_at_once or max(1, int(ray.cluster_resources().get("CPU", 1)))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     Results = dict[str, dict[str, list[Result]]]
 
 SEEDS = (0, 1, 2, 3, 4)
-#: Inside the folder of all results: what the returns of random actions are.
+#: Inside the folder of all results: the returns of random actions.
 RANDOM_ACTIONS = "random-actions"
 
 
@@ -28,9 +28,9 @@ RANDOM_ACTIONS = "random-actions"
 class TableRow:
     """A row of a family's table: a method under a label.
 
-    :param name: what the table calls it
-    :param seeds: those that count; ``None`` for all that there are
-    :param families: those that have this row; ``None`` for all
+    :param name: in the table
+    :param seeds: seeds to include; ``None`` for all existing ones
+    :param families: families with this row; ``None`` for all
     """
 
     name: str
@@ -41,13 +41,13 @@ class TableRow:
 
 
 def asked_rows(arguments: argparse.Namespace) -> list[TableRow]:
-    """A row for each method that the flags ask for."""
+    """A row for each requested method."""
     seeds = arguments.seeds or (None if arguments.table_only else SEEDS)
     return [TableRow(method, method, arguments.label, seeds) for method in arguments.algos or ALGORITHMS]
 
 
 def require_results(folder: str, families: Iterable[str], rows: Sequence[TableRow]) -> Results:
-    """:func:`results_of_rows`, some of each family.
+    """:func:`results_of_rows`, with at least one result of each family.
 
     :raises ValueError: for a family without a result
     """
@@ -59,21 +59,21 @@ def require_results(folder: str, families: Iterable[str], rows: Sequence[TableRo
 
 
 def no_results(folder: str, family: str) -> str:
-    """The message for a family without results, with the folders of results that there are."""
+    """The message for a family without results, with the existing folders of results."""
     folders = sorted(path.parent.name for path in Path(folder).glob("*/*-seed*.json"))
     known = f"; there are {', '.join(dict.fromkeys(folders))}" if folders else ""
     return f"{folder} has no results of {family} with these methods and seeds{known}"
 
 
 def benchmark_results(arguments: argparse.Namespace, families: Iterable[str]) -> Results:
-    """The results of the methods that the flags ask for."""
+    """The results of the requested methods."""
     return results_of_rows(arguments.folder, families, asked_rows(arguments))
 
 
 def results_of_rows(folder: str, families: Iterable[str], rows: Sequence[TableRow]) -> Results:
-    """The results that there are, of the rows that have some.
+    """The existing results, without rows that have none.
 
-    :raises ValueError: for a damaged file, and for results that cannot stand in one table
+    :raises ValueError: for a damaged file, and for results that do not belong in one table
     """
     from sb3_fedguide.benchmark.results import check_comparable, read_results
 
@@ -130,7 +130,7 @@ def make_tables(
 
 
 def random_level(folder: Path, family: Family) -> float:
-    """What random actions return, measured once and kept with the results."""
+    """The return of random actions, measured once and stored with the results."""
     from sb3_fedguide.benchmark.aggregate import random_actions
     from sb3_fedguide.cli.run_folder import write_json
 
@@ -155,7 +155,7 @@ def random_level(folder: Path, family: Family) -> float:
 
 
 def write_tables(arguments: argparse.Namespace, tables: Tables) -> None:
-    """To the files that the flags name; on the terminal, unless one of them is to be there."""
+    """Write the tables to the files that the flags name; also print them, unless a flag prints its own format."""
     from sb3_fedguide.cli.benchmark_tables import WRITERS, print_tables
     from sb3_fedguide.cli.run_folder import write_text
 

@@ -1,4 +1,4 @@
-"""The runs of a benchmark: each a training command in a process of its own, which goes on where an earlier one stopped."""
+"""The runs of a benchmark: each is a training command in its own process, which resumes an earlier one."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from sb3_fedguide.settings.config import read_yaml
 
 #: The training command; a run's flags follow.
 TRAIN = (sys.executable, "-m", "sb3_fedguide", "train")
-#: Inside the folder of a family's results: what runs need to go on.
+#: Inside the folder of a family's results: the folders of unfinished runs.
 RUNS = "runs"
-#: Seconds between looks at the runs.
+#: Seconds between checks of the runs.
 POLL = 0.1
-#: Seconds between reports of what runs are doing.
+#: Seconds between reports of the runs' progress.
 REPORT = 60.0
-#: How much of a failed run's output its report shows.
+#: Lines of a failed run's output in its report.
 SHOWN_LINES = 12
 
 
@@ -38,12 +38,12 @@ SHOWN_LINES = 12
 class BenchmarkRun:
     """One run to do. Paths are absolute: it may be done on another machine.
 
-    :param result: file that says that it is done
-    :param log_folder: what its training command writes into, and nobody else
-    :param flags: of the training command, where it begins
-    :param resume_flags: of the training command, where it goes on
-    :param folder: where the commands run, if the machine has it
-    :param title: what the method is called; by default its name
+    :param result: result file; the run is done if it exists
+    :param log_folder: folder of its training command's output, used by no other run
+    :param flags: of the training command, to begin
+    :param resume_flags: of the training command, to resume
+    :param folder: working directory of the commands, if the machine has it
+    :param title: displayed name of the method; by default its name
     """
 
     method: str
@@ -63,11 +63,11 @@ class BenchmarkRun:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a run.
+    """The outcome of a run.
 
     :param content: of its result file, if it is finished
-    :param problem: why it is not
-    :param interrupted: whether that is so because it was told to stop
+    :param problem: the reason if it is not
+    :param interrupted: whether it was stopped by a signal
     """
 
     content: Mapping[str, Any] | None = None
@@ -76,18 +76,18 @@ class Outcome:
 
 
 def log_folder_of(result: Path) -> Path:
-    """What the training command of the run with this result file writes into."""
+    """The folder of the training command's output, for the run with this result file."""
     return result.parent / RUNS / result.stem
 
 
 def interrupted_folder(log_folder: Path, method: str) -> Path | None:
-    """The folder of a run that began in ``log_folder`` and can go on: the last whose inputs are all written down."""
+    """The folder of a run that began in ``log_folder`` and can be resumed: the last one with all of its inputs."""
     folders = [path.parent for path in (log_folder / method).glob("*_*/metadata.json")]
     return max(folders, key=lambda folder: int(folder.name.rsplit("_", 1)[1]), default=None)
 
 
 class RunProcess:
-    """A run's training command in a process of its own, and the right to do the run until :meth:`release`."""
+    """A run's training command in its own process, with the exclusive right to do the run until :meth:`release`."""
 
     def __init__(self, run: BenchmarkRun) -> None:
         self.run = run
@@ -97,7 +97,7 @@ class RunProcess:
         self._log_start, self._stopped = 0, False
 
     def start(self) -> None:
-        """Start it, unless another benchmark has finished it meanwhile.
+        """Start it, unless another benchmark has finished it in the meantime.
 
         :raises ValueError: if another process is doing this run
         """
@@ -124,19 +124,19 @@ class RunProcess:
         return self._process is not None and self._process.poll() is None
 
     def doing(self) -> str:
-        """Its stage, how long that has taken, and what is left of it."""
+        """Its stage, with the seconds so far and the remaining ones."""
         folder = interrupted_folder(self.run.log_folder, self.run.method)
         stage = None if folder is None else read_status(folder)
         return "beginning" if stage is None else str(stage)
 
     def stop(self) -> None:
-        """Let it end after its running round, with a checkpoint."""
+        """Let it end after its current round, with a checkpoint."""
         if not self._stopped and self._process is not None:
             self._stopped = True
             self._process.terminate()
 
     def kill(self) -> None:
-        """End it at once, and what it has started."""
+        """Kill it and its child processes."""
         self._stopped = True
         if self._process is not None and self._process.poll() is None:
             os.killpg(self._process.pid, signal.SIGKILL)
@@ -148,7 +148,7 @@ class RunProcess:
         self._lock.close()
 
     def outcome(self) -> Outcome:
-        """What became of it, once it is not running any more."""
+        """Its outcome, after its end."""
         if self._process is None:
             return Outcome(json.loads(self.run.result.read_text(encoding="utf-8")))
         code = self._process.returncode
@@ -167,7 +167,7 @@ class RunProcess:
 
 
 def _content(run: BenchmarkRun) -> dict[str, Any] | None:
-    """What the result file of a run is to hold, if the run is finished."""
+    """The content of a run's result file, if the run is finished."""
     folder = interrupted_folder(run.log_folder, run.method)
     if folder is None or finished_rounds(folder) is None:
         return None
@@ -176,7 +176,7 @@ def _content(run: BenchmarkRun) -> dict[str, Any] | None:
 
 
 def execute(run: BenchmarkRun) -> Outcome:
-    """Do one run and wait for it. SIGINT, which is how Ray cancels a task, lets it end after its running round."""
+    """Do one run and wait for it. SIGINT, with which Ray cancels a task, lets it end after its current round."""
     process = RunProcess(run)
     earlier = signal.signal(signal.SIGINT, lambda *_: process.stop())
     try:
@@ -200,10 +200,10 @@ def run_here(
 ) -> None:
     """Do the runs in processes on this machine.
 
-    :param n_processes: so many at a time
-    :param signals: after the first signal, nothing is begun and what runs ends after its round; at the second, all are killed
-    :param done: called for each run that ends, and for those that could not be started
-    :param say: called every minute with what each run is doing
+    :param n_processes: runs at a time
+    :param signals: after the first signal, no run begins and the others end after their round; at the second, all are killed
+    :param done: called for each run that ends, and for runs that could not be started
+    :param say: called every minute with each run's progress
     """
     waiting, running, reported = deque(runs), list[RunProcess](), time.monotonic()
     try:
@@ -232,7 +232,7 @@ def run_here(
 
 
 def forget(run: BenchmarkRun) -> None:
-    """Remove what a finished run has left besides its result."""
+    """Remove all files of a finished run except its result."""
     shutil.rmtree(run.log_folder, ignore_errors=True)
     with suppress(OSError):  # other runs are still there
         run.log_folder.parent.rmdir()

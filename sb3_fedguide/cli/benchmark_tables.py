@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Tables:
-    """What a benchmark has found.
+    """The tables of a benchmark.
 
     :param families: name of the results, such as ``HopperHard-tuned``, to one row per method
     :param aggregates: methods over all families; empty for a single one
-    :param notes: what is to be said about them
-    :param overview: columns that get a table of their own, with a row per family and a column per method
+    :param notes: remarks below the tables
+    :param overview: columns that get their own table, with a row per family and a column per method
     """
 
     families: Mapping[str, Sequence[Measures]]
@@ -45,14 +45,14 @@ LEGEND = (
 
 
 def rows_of(measures: Sequence[Measures]) -> list[Row]:
-    """The cells of one family's table by column; columns that no method has a value for are left out."""
+    """The cells of one family's table by column; columns without any value are left out."""
     return _table(columns_of(dict.fromkeys(round for row in measures for round in row.curve)), measures)
 
 
 def columns_of(rounds: Iterable[int] = ()) -> dict[str, Callable[[Measures], str | None]]:
-    """Name of a column to what it shows of a method.
+    """Name of a column to the text of its cell for a method.
 
-    :param rounds: of the curve
+    :param rounds: of the learning curve
     """
     return {
         "method": lambda row: row.method,
@@ -135,7 +135,7 @@ def print_tables(tables: Tables) -> None:
 
 
 def print_rows(title: str, rows: Sequence[Row], *notes: str) -> None:
-    """On the terminal; what is wider than it is continued below, the first column repeated."""
+    """Print a table on the terminal; columns that do not fit follow below, with the first column repeated."""
     from rich.console import Console
     from rich.table import Table
 
@@ -151,7 +151,7 @@ def print_rows(title: str, rows: Sequence[Row], *notes: str) -> None:
 
 
 def print_notes(*notes: str) -> None:
-    """On the terminal, each on lines of its own."""
+    """Print notes on the terminal, each on its own lines."""
     from rich.console import Console
 
     for note in notes:
@@ -159,7 +159,7 @@ def print_notes(*notes: str) -> None:
 
 
 def fitting(rows: Sequence[Row], width: int) -> list[list[str]]:
-    """The columns in groups that are at most so many characters wide, each with the first column before it."""
+    """The columns in groups of at most ``width`` characters, each with the first column before it."""
     first, *others = rows[0]
     sizes = {name: 3 + max(len(name), *(len(row[name]) for row in rows)) for name in rows[0]}  # padding and a border
     groups: list[list[str]] = []
@@ -211,7 +211,7 @@ def _escaped(text: str) -> str:
 
 
 def as_json(tables: Tables) -> str:
-    """Every figure in full precision; what is no finite number is ``null``."""
+    """Every number in full precision; a non-finite number is ``null``."""
     content = {
         "families": {name: [asdict(row) for row in measures] for name, measures in tables.families.items()},
         "aggregate": [asdict(row) for row in tables.aggregates],
@@ -244,5 +244,5 @@ def as_csv(tables: Tables) -> str:
     return file.getvalue()
 
 
-#: By the flag of the command that asks for them.
+#: Formats by the flag of the command.
 WRITERS: dict[str, Callable[[Tables], str]] = {"markdown": markdown, "latex": latex, "json": as_json, "csv": as_csv}

@@ -1,4 +1,4 @@
-"""The command that makes a Minari dataset from logs of one's own: CSV or NPZ files of what a robot did."""
+"""The command that makes a Minari dataset from a user's own logs: CSV or NPZ files of a robot's transitions."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ def _parser(prog: str, columns: dict[str, tuple[str, ...]]) -> OneLineParser:
     flag = parser.add_argument
     flag("dataset", metavar="DATASET", help="id such as robots/arm0-v0, or a path that begins with . or /")
     flag("logs", nargs="+", metavar="LOG", help="CSV files with a header, or NPZ files, in their order; each ends an episode")
-    flag("--env", metavar="ID", help="whose action space the data have: a Gymnasium id, or a family")
+    flag("--env", metavar="ID", help="environment with the action space of the data: a Gymnasium id, or a family")
     flag("--action-low", nargs="+", type=float, metavar="A", help="lower bounds of the actions, instead of --env")
     flag("--action-high", nargs="+", type=float, metavar="A", help="upper bounds of the actions")
     flag("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first")
     for entry, known in columns.items():
         flag(f"--{entry.replace('_', '-')}", nargs="+", metavar="NAME", help=f"columns (CSV) or array (NPZ) of the {entry}, "
              f"by default {' or '.join(known)}, in CSV with numbers or words after an underscore")  # fmt: skip
-    flag("--overwrite", action="store_true", help="replace a dataset that is there")
+    flag("--overwrite", action="store_true", help="replace an existing dataset")
     return parser
 
 
 def _action_space(arguments: argparse.Namespace) -> Space:
-    """:raises ValueError: where the flags do not say what it is"""
+    """:raises ValueError: if the flags do not define it"""
     import gymnasium
     import numpy as np
 
@@ -60,10 +60,10 @@ def _action_space(arguments: argparse.Namespace) -> Space:
 
     low, high = arguments.action_low, arguments.action_high
     if (arguments.env is None) == (low is None) or (low is None) != (high is None):
-        raise ValueError("say what actions the client takes: --env ID, or --action-low and --action-high")
+        raise ValueError("give the client's action space: --env ID, or --action-low and --action-high")
     if low is not None:
         if len(low) != len(high) or not all(a < b for a, b in zip(low, high, strict=True)):
-            raise ValueError(f"--action-low {low} and --action-high {high} are no bounds of one action")
+            raise ValueError(f"--action-low {low} and --action-high {high} are not bounds of one action")
         return gymnasium.spaces.Box(np.array(low, dtype=np.float32), np.array(high, dtype=np.float32))
     import_packages(arguments.gym_packages)
     try:

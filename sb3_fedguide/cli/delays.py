@@ -10,7 +10,7 @@ __all__ = ["DelaySettings", "read_delays"]
 
 
 def read_delays(given: str) -> DelaySettings:
-    """What :func:`parse_delays` reads, or a mapping of the same names in a ``.yml`` or ``.yaml`` file.
+    """Read a text as in :func:`parse_delays`, or a mapping of the same names in a ``.yml`` or ``.yaml`` file.
 
     :raises ValueError: for anything else
     """

@@ -1,4 +1,4 @@
-"""The demonstration: FedAvg and FedGuide on Bandit2D with the zoo's settings, and a picture of what they learn."""
+"""The demonstration: FedAvg and FedGuide on Bandit2D with the zoo's settings, and a picture of their policies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ppo import FederatedPPO
     from sb3_fedguide.settings.config import Config
 
-#: Trained in this order; Local is drawn as a curve only.
+#: Trained in this order; Local is drawn only as a learning curve.
 METHODS = {"Local": "local", "FedAvg": "fedavg", "FedGuide": "fedguide"}
 DRAWN = ("FedAvg", "FedGuide")
 
@@ -25,7 +25,7 @@ DRAWN = ("FedAvg", "FedGuide")
 def main(argv: Sequence[str] | None = None) -> int:
     """Train both, print the measures, write the picture and the numbers."""
     parser = OneLineParser(prog="fedguide demo", description=__doc__)
-    parser.add_argument("-f", "--folder", default="runs/demo", metavar="DIR", help="where the picture goes")
+    parser.add_argument("-f", "--folder", default="runs/demo", metavar="DIR", help="folder of the picture")
     parser.add_argument("-conf", "--conf-file", default="tuned", metavar="CONF", help="tuned, paper, quick, or a YAML file")
     parser.add_argument("--rounds", type=int, metavar="N", help="communication rounds, by default those of the configuration")
     parser.add_argument("--seed", type=int, default=0)

@@ -21,9 +21,9 @@ from sb3_fedguide.exit_codes import EXIT_FAILED, EXIT_USAGE
 if TYPE_CHECKING:
     from sb3_fedguide.deployment.config_files import ClientDeployment
 
-#: In a deployment's folder, what its processes are told.
+#: In a deployment's folder, the settings of its processes.
 CONFIG = "config.json"
-#: How little Flower and gRPC say in the journal, unless the user's environment says otherwise; read when they are imported.
+#: Log levels of Flower and gRPC in the journal, unless the user's environment sets others; read when they are imported.
 QUIET = {"FLWR_LOG_LEVEL": "WARNING", "GRPC_VERBOSITY": "ERROR"}
 
 
@@ -31,7 +31,7 @@ QUIET = {"FLWR_LOG_LEVEL": "WARNING", "GRPC_VERBOSITY": "ERROR"}
 def main(argv: Sequence[str]) -> int:
     """Run the command.
 
-    :return: the exit code: 0, 1 where a part failed and trying again is of use, 2 for wrong input, 130 after an interrupt
+    :return: the exit code: 0, 1 if a part failed and a retry is useful, 2 for wrong input, 130 after an interrupt
         (SIGINT), 143 after SIGTERM
     """
     arguments = _parser().parse_args(argv)
@@ -59,13 +59,13 @@ def _parser() -> OneLineParser:
     parser = OneLineParser(prog="fedguide deploy", allow_abbrev=False, description=f"{__doc__} See docs/deployment.md.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     certificates = commands.add_parser("certificates", help="make the server's certificate, and an authority if there is none")
-    certificates.add_argument("folder", type=Path, metavar="DIR", help="where ca.crt, ca.key, server.crt and server.key go")
+    certificates.add_argument("folder", type=Path, metavar="DIR", help="folder for ca.crt, ca.key, server.crt and server.key")
     certificates.add_argument("--host", action="append", required=True, metavar="NAME", help="name or address under which "
                               "clients reach the server; can be given more than once")  # fmt: skip
-    certificates.add_argument("--days", type=int, default=825, help="how long the certificate holds (%(default)s)")
+    certificates.add_argument("--days", type=int, default=825, help="days until the certificate expires (%(default)s)")
     certificates.set_defaults(run=_certificates)
     key = commands.add_parser("key", help="make a client's pair of keys, on the client's machine")
-    key.add_argument("folder", type=Path, metavar="DIR", help="where NAME and NAME.pub go")
+    key.add_argument("folder", type=Path, metavar="DIR", help="folder for NAME and NAME.pub")
     key.add_argument("name", metavar="NAME", help="of the client, e.g. client_0")
     key.set_defaults(run=_key)
     server = commands.add_parser("server", help="run the server until the federation's last round")
@@ -129,30 +129,32 @@ def _client(arguments: argparse.Namespace) -> int:
     if not node.finished:
         _check_server(deployment)
     with exclusive(deployment.folder):
-        # What is wrong with it is said now; in another process, since forks cannot use a GPU that this one has used.
+        # Report its errors now; in another process, since forks cannot use a GPU that this process has used.
         with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as processes:
             processes.submit(_try_site, deployment).result()
         write_json(config, deployment.process_settings())
         print(f"client {deployment.site.get('client')} of {deployment.server}, writing to {deployment.folder}", flush=True)
         node.run()
-        print(f"the federation has had its last round; a new one needs a folder other than {deployment.folder}", flush=True)
+        print(
+            f"the federation has finished its last round; a new one needs a folder other than {deployment.folder}", flush=True
+        )
     return 0
 
 
 def _check_server(deployment: ClientDeployment) -> None:
-    """Say what Flower would not: it takes a server with the wrong certificate for one that is not there.
+    """Check the server's certificate: for Flower, a server with the wrong certificate looks like an absent one.
 
-    :raises ValueError: where ``ca`` holds no certificate
-    :raises ConnectionError: where somebody else answers
+    :raises ValueError: if ``ca`` holds no certificate
+    :raises ConnectionError: if another server answers
     """
     import httpx
 
     try:
         context = ssl.create_default_context(cafile=deployment.ca)
     except ssl.SSLError:
-        raise ValueError(f"{deployment.ca} holds no certificate; it has to be the ca.crt of the server's machine") from None
+        raise ValueError(f"{deployment.ca} holds no certificate; it must be the ca.crt of the server's machine") from None
     try:
-        # By the way that Flower takes, a proxy included.
+        # The same route as Flower's, also through a proxy.
         with httpx.Client(verify=context, timeout=10.0) as client:
             client.get(f"https://{deployment.server}/")
     except httpx.HTTPError as error:
@@ -172,7 +174,7 @@ def _try_site(deployment: ClientDeployment) -> None:
 
 
 def _prepare(folder: Path) -> Path:
-    """Make a deployment's folder, for nobody else to look into; return the path of what its processes are told."""
+    """Make a deployment's folder, private to this user; return the path of its processes' settings."""
     folder.mkdir(parents=True, exist_ok=True)
     os.chmod(folder, 0o700)
     return folder / CONFIG

@@ -64,24 +64,29 @@ def _parser(prog: str) -> OneLineParser:
 
     parser = OneLineParser(prog=prog, description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     flag = parser.add_argument
-    flag("run", metavar="RUN", help="folder of a run, e.g. logs/fedguide/HopperHard_1, or the name of one "
-         "that comes with the package, e.g. Bandit2D")  # fmt: skip
-    flag("--policy", choices=("deployed", "broadcast", "both"), default="both", help="the clients' own policies as they left "
-         "local training, what the server sent after it, or both where they differ")  # fmt: skip
+    flag("run", metavar="RUN", help="folder of a run, e.g. logs/fedguide/HopperHard_1, or the name of a "
+         "run in this package, e.g. Bandit2D")  # fmt: skip
+    flag("--policy", choices=("deployed", "broadcast", "both"), default="both", help="the clients' own policies after "
+         "local training, the policies that the server sent then, or both if they differ")  # fmt: skip
     flag("--episodes", type=int, default=10, metavar="N", help="episodes per client")
-    flag("--seed", type=int, default=EVALUATION_SEED, help="of the episodes; the default is that of training's evaluations")
-    flag("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first, which register algorithms "
-         "of your own")  # fmt: skip
+    flag(
+        "--seed",
+        type=int,
+        default=EVALUATION_SEED,
+        help="random seed of the episodes; by default that of the evaluations during training",
+    )
+    flag("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first; they register your own "
+         "algorithms")  # fmt: skip
     flag("--stochastic", action="store_true", help="sample actions instead of taking their mean")
     flag("-o", "--output", metavar="FILE", help="write the JSON there instead of to the terminal")
-    flag("--video", metavar="DIR", help="write a video of one deterministic episode of each client there, which is "
-         "not among those that are evaluated")  # fmt: skip
+    flag("--video", metavar="DIR", help="write a video of one deterministic episode of each client there, apart from "
+         "the evaluated ones")  # fmt: skip
     flag("--video-format", choices=FORMATS, default="gif", help="gif, or mp4, which needs pip install 'sb3-fedguide[video]'")
     return parser
 
 
 def _read_run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Config, Family]:
-    """:raises ValueError: if the folder is none of a trained run, or its algorithm or world needs a module to be imported"""
+    """:raises ValueError: if the folder is not that of a trained run, or needs a module for its algorithm or world"""
     from sb3_fedguide.settings.config import read_yaml
 
     folder = Path(arguments.run)
@@ -93,7 +98,7 @@ def _read_run(arguments: argparse.Namespace) -> tuple[dict[str, Any], Config, Fa
         if not isinstance(modules, list) or set(map(str, modules)) <= set(arguments.gym_packages):
             raise
         needed = " ".join(map(str, modules))
-        raise ValueError(f"{error}; the run was trained with --gym-packages {needed}: give that here as well") from None
+        raise ValueError(f"{error}; the run was trained with --gym-packages {needed}: give it here as well") from None
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -111,7 +116,7 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _policies(arguments: argparse.Namespace, folder: Path, model: Federation) -> dict[str, dict[str, np.ndarray]]:
-    """What to evaluate: a policy's name to the parameters to put in place of the saved model's (none for itself).
+    """The policies to evaluate: name to the parameters that replace the saved model's (none for its own).
 
     :raises ValueError: if the file of deployed policies is damaged or another model's
     """
@@ -122,9 +127,9 @@ def _policies(arguments: argparse.Namespace, folder: Path, model: Federation) ->
     deployed = read_deployed_policies(folder, model)
     own = model.acting_arrays()
     if all(np.array_equal(array, own[name]) for name, array in deployed.items() if not name.startswith("normalizer/")):
-        # the exchange did not touch the policies, or their observations' scale alone: there is one of each client
+        # the exchange did not change the policies, or only their observation statistics: each client has one policy
         if arguments.policy == "broadcast":
-            raise ValueError("the last exchange sent no policies, so there is no broadcast one; leave --policy out")
+            raise ValueError("the last exchange sent no policies, so there is no broadcast policy; leave --policy out")
         return {"deployed": deployed}
     found = {"deployed": deployed, "broadcast": {}}
     return found if arguments.policy == "both" else {arguments.policy: found[arguments.policy]}

@@ -1,4 +1,4 @@
-"""The export command: clients' policies out of a run's or a deployment's folder, for use where this package is not."""
+"""The export command: clients' policies from a run's or a deployment's folder, for use without this package."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sb3_fedguide.cli.run_folder import PARAMETERS, read_deployed
 if TYPE_CHECKING:
     from sb3_fedguide.common.export import ClientPolicy
 
-#: What ``--format`` says to the suffix of the file.
+#: Name for ``--format`` to the suffix of the file.
 SUFFIXES = {"sb3": ".zip", "pt2": ".pt2", "torchscript": ".pt", "onnx": ".onnx"}
 
 
@@ -38,12 +38,12 @@ def _parser(prog: str) -> OneLineParser:
     flag = parser.add_argument
     flag("folder", metavar="FOLDER", type=Path, help="folder of a run, e.g. logs/fedguide/HopperHard_1, or of a deployed "
          f"client; or the {PARAMETERS} itself")  # fmt: skip
-    flag("--clients", type=int, nargs="+", metavar="K", help="whose policies; all by default")
+    flag("--clients", type=int, nargs="+", metavar="K", help="clients to export; all by default")
     flag("--format", nargs="+", choices=tuple(SUFFIXES), default=["sb3"], help="an archive for stable_baselines3, a "
          "torch.export program, TorchScript, or ONNX")  # fmt: skip
-    flag("--policy", choices=("deployed", "broadcast"), default="deployed", help="a run's policies as they left local "
-         "training, or what the server sent after it; a deployed client has the latter alone")  # fmt: skip
-    flag("-o", "--output", type=Path, metavar="DIR", help="where the files go; by default to policies in the folder")
+    flag("--policy", choices=("deployed", "broadcast"), default="deployed", help="a run's policies after local "
+         "training, or those that the server sent then; a deployed client has only the latter")  # fmt: skip
+    flag("-o", "--output", type=Path, metavar="DIR", help="folder of the files; by default policies in FOLDER")
     return parser
 
 
@@ -73,7 +73,7 @@ def _parameter_file(path: Path) -> Path:
             return candidate
     if any(checkpoints(folder) for folder in (path, path / SITE)):
         raise ValueError(f"{path} has no {PARAMETERS} yet: a client writes it after the federation's last round")
-    raise ValueError(f"{path} is no folder of a run or of a deployed client: it has no {PARAMETERS}")
+    raise ValueError(f"{path} is not a folder of a run or of a deployed client: it has no {PARAMETERS}")
 
 
 def _policies(file: Path, policy: str) -> dict[int, ClientPolicy]:

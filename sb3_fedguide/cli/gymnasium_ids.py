@@ -18,7 +18,7 @@ def is_registered(name: str) -> bool:
 
 
 def registered_family(ids: Sequence[str], client_kwargs: str | None, env_kwargs: Sequence[str]) -> Family:
-    """The clients that ``--env``, ``--client-kwargs`` and ``--env-kwargs`` mean.
+    """The clients of ``--env``, ``--client-kwargs`` and ``--env-kwargs``.
 
     :param ids: one per client, or one for all
     :raises ValueError: for unknown ids, a wrong file, or numbers that do not fit
@@ -36,7 +36,7 @@ def registered_family(ids: Sequence[str], client_kwargs: str | None, env_kwargs:
     if len(ids) == 1:
         ids = [*ids] * len(own)
     if len(ids) != len(own):
-        raise ValueError(f"--env has {len(ids)} ids and {client_kwargs} has {len(own)} entries; each client has one of both")
+        raise ValueError(f"--env has {len(ids)} ids and {client_kwargs} has {len(own)} entries; give one of each per client")
     return gymnasium_family(ids, [{**common, **entry} for entry in own])
 
 
@@ -47,6 +47,6 @@ def _read(path: Path) -> list[dict[str, Any]]:
     entries = [{} if entry is None else entry for entry in content] if isinstance(content, list) else []
     if not entries or not all(isinstance(entry, dict) and all(isinstance(key, str) for key in entry) for entry in entries):
         raise ValueError(
-            f"--client-kwargs {path}: it has to be a YAML list of mappings, one per client, such as '- {{g: 9.81}}'"
+            f"--client-kwargs {path}: it must be a YAML list of mappings, one per client, such as '- {{g: 9.81}}'"
         )
     return entries

@@ -1,4 +1,4 @@
-"""What `fedguide push` and `fedguide pull` have in common: which files of a run travel, how large they may be, and checks."""
+"""Common parts of `fedguide push` and `fedguide pull`: the shared files of a run, their size limits, and checks."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from sb3_fedguide.settings.config import Config
 
 CARD, CURVE = "README.md", "curve.png"
-#: Files without which a run's folder is none.
+#: Files that every run's folder must have.
 NEEDED = ("config.yml", "metadata.json", "summary.json", PARAMETERS)
-#: What travels, and the most bytes that it may have; nothing else is sent or taken, and none of it is pickled.
+#: Shared files, and their size limits in bytes; no other file is sent or taken, and none of them is pickled.
 FILES = {
     PARAMETERS: 256_000_000,
     DEPLOYED: 256_000_000,
@@ -37,7 +37,7 @@ FILES = {
     CURVE: 5_000_000,
 }
 LOGIN = "log in with 'hf auth login', or set HF_TOKEN (https://huggingface.co/settings/tokens)"
-#: Environments that a pulled run may have at a time, those of all clients together.
+#: Largest number of environments of a pulled run, all clients together.
 MAX_ENVIRONMENTS = 4096
 #: Numbers in networks that a run's settings may ask for beyond those in its arrays, such as values of the offline stage that
 #: its method does not have.
@@ -45,7 +45,7 @@ MAX_UNUSED = 50_000_000
 
 
 class RefusedError(ValueError):
-    """A run may be sound, but ``fedguide pull`` would not make its environments or networks here."""
+    """A run may be correct, but ``fedguide pull`` refuses to make its environments or networks."""
 
 
 def hub_api() -> HfApi:
@@ -60,17 +60,17 @@ def hub_api() -> HfApi:
 
 
 def check_repository(name: str) -> None:
-    """:raises ValueError: for what is no ``OWNER/NAME``"""
+    """:raises ValueError: for a name that is not ``OWNER/NAME``"""
     part = r"[A-Za-z0-9][A-Za-z0-9._-]{0,95}"
     if not re.fullmatch(f"{part}/{part}", name) or ".." in name or name.endswith((".git", ".", "-")):
-        raise ValueError(f"{name!r} is no repository of the hub: give OWNER/NAME, of letters, digits and . _ -")
+        raise ValueError(f"{name!r} is not a repository of the hub: give OWNER/NAME, of letters, digits and . _ -")
 
 
 @contextmanager
 def hub_errors(api: HfApi, repository: str, revision: str | None = None) -> Iterator[None]:
-    """What the hub refuses or does not answer, as one line that says what to do.
+    """Turn errors of the hub into one line with a remedy.
 
-    :raises ValueError: for all of it
+    :raises ValueError: for all of them
     """
     from httpx2 import HTTPError
     from huggingface_hub import errors
@@ -78,10 +78,10 @@ def hub_errors(api: HfApi, repository: str, revision: str | None = None) -> Iter
     try:
         yield
     except errors.GatedRepoError:
-        raise ValueError(f"{repository} is given to those only who ask its owner on {api.endpoint}; then {LOGIN}") from None
+        raise ValueError(f"{repository} needs its owner's permission: ask for it on {api.endpoint}, then {LOGIN}") from None
     except errors.RepositoryNotFoundError:
         raise ValueError(
-            f"there is no repository {repository} on {api.endpoint}, or it is a private one that you may not see: {LOGIN}"
+            f"there is no repository {repository} on {api.endpoint}, or it is private and you have no access: {LOGIN}"
         ) from None
     except errors.RevisionNotFoundError:
         raise ValueError(f"{repository} has no revision {revision}; give one of its branches, tags or commits") from None
@@ -91,18 +91,18 @@ def hub_errors(api: HfApi, repository: str, revision: str | None = None) -> Iter
         remedy = f"; {LOGIN}, with a token that may write there" if status in (401, 403) else ""
         raise ValueError(f"{api.endpoint} refuses this for {repository} ({status}): {reason}{remedy}") from None
     except errors.OfflineModeIsEnabled:
-        raise ValueError("HF_HUB_OFFLINE is set, so the hub is not asked; unset it") from None
+        raise ValueError("HF_HUB_OFFLINE is set, so the hub is not contacted; unset it") from None
     except HTTPError as error:
         raise ValueError(f"{api.endpoint} cannot be reached ({error or type(error).__name__}); is there a network?") from None
-    except RuntimeError as error:  # an upload that broke, whose cause says why
+    except RuntimeError as error:  # a failed upload, with the reason in its cause
         raise ValueError(f"{api.endpoint}: {error} ({error.__cause__ or type(error).__name__})") from None
 
 
 @contextmanager
 def hub_answers(api: HfApi) -> Iterator[None]:
-    """Around nothing but requests and the reading of their answers: these may be another service's.
+    """Wrap only requests and the parsing of their answers: another service may answer.
 
-    :raises ValueError: for an answer that the hub does not give
+    :raises ValueError: for an answer that the hub would not give
     """
     try:
         yield
@@ -111,11 +111,11 @@ def hub_answers(api: HfApi) -> Iterator[None]:
 
 
 def check_run(folder: Path, packages: Sequence[str]) -> tuple[dict[str, Any], Config, Family]:
-    """Make the federation of a run's folder, as evaluations do: whether its files are sound and belong together.
+    """Make the federation of a run's folder, as evaluations do, to check that its files are valid and fit together.
 
     :param packages: modules that register its algorithm or world
     :return: its ``summary.json``, hyperparameters and family
-    :raises RefusedError: for settings that claim more than its arrays have, or may name files
+    :raises RefusedError: for settings that need more than its arrays have, or that may name files
     :raises ValueError: for a folder of something else
     """
     from sb3_fedguide.cli.saved_run import load_model, read_deployed_policies, read_run
@@ -129,15 +129,15 @@ def check_run(folder: Path, packages: Sequence[str]) -> tuple[dict[str, Any], Co
 
 
 def _check_claims(folder: Path, config: Config, family: Family) -> None:
-    """Before anything is made of them: a few bytes of settings can ask for more than any machine has.
+    """Check settings before their use: a few bytes of settings can ask for more memory than any machine has.
 
-    :raises RefusedError: where they do, or where environments of Gymnasium's may read files
+    :raises RefusedError: if they do, or if Gymnasium's environments may read files
     """
     values = config.values
     n_envs = family.n_clients * values["n_envs_per_client"]
     if n_envs > MAX_ENVIRONMENTS:
         raise RefusedError(
-            f"{folder} asks for {n_envs} environments; at most {MAX_ENVIRONMENTS} are made of somebody's settings"
+            f"{folder} asks for {n_envs} environments; at most {MAX_ENVIRONMENTS} are made from downloaded settings"
         )
     layers = values["policy_kwargs"]["net_arch"] or []
     networks = list(layers.values()) if isinstance(layers, dict) else [layers, layers]
@@ -151,7 +151,7 @@ def _check_claims(folder: Path, config: Config, family: Family) -> None:
             if re.search(r"[/\\:]", text):
                 raise RefusedError(
                     f"client {client.client} of {folder} has the keyword argument {text!r}, which may name a file or a "
-                    "module; register an environment of your own that says it itself (--gym-packages)"
+                    "module; register your own environment that sets it itself (--gym-packages)"
                 )
 
 

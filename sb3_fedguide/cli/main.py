@@ -1,4 +1,4 @@
-"""The console script ``fedguide``: its subcommands. Each imports what it needs when it is called."""
+"""The console script ``fedguide``: its subcommands. Each imports its modules when it is called."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ USAGE = """usage: fedguide COMMAND ...
 
   train      train a federation (the same as train.py)
   evaluate   evaluate a finished run's policies, client by client
-  export     clients' policies for use elsewhere: Stable-Baselines3, TorchScript, torch.export, ONNX
-  push       a run to the Hugging Face hub, without pickle, with a model card
-  pull       a run from there, checked
-  benchmark  methods on families with seeds, as runs that can be interrupted, and tables of their results
-  plot       figures of a benchmark's results or of runs: learning curves, bars, rollouts, transport plan, ...
+  export     export clients' policies: Stable-Baselines3, TorchScript, torch.export, ONNX
+  push       upload a run to the Hugging Face hub, without pickle, with a model card
+  pull       download a run from the hub and check it
+  benchmark  train methods on families with seeds, as resumable runs, and print tables of their results
+  plot       draw figures of a benchmark's results or of runs: learning curves, bars, rollouts, transport plan, ...
   tune       search for an algorithm's hyperparameters with Optuna
-  deploy     a federation over a network: certificates, keys, server and clients
-  dataset    a Minari dataset for the offline stage from CSV or NPZ logs
-  demo       FedAvg beside FedGuide on Bandit2D, with a picture
+  deploy     run a federation over a network: certificates, keys, server and clients
+  dataset    make a Minari dataset for the offline stage from CSV or NPZ logs
+  demo       train FedAvg and FedGuide on Bandit2D, with a picture
 
 fedguide COMMAND --help shows a command's flags"""
 

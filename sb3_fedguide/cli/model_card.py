@@ -1,4 +1,4 @@
-"""What stands beside a run on the Hugging Face hub: a card with its returns and the commands to use it, and its curve."""
+"""The model card of a run on the Hugging Face hub: its returns, the commands to use it, and its learning curve."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sb3_fedguide.cli.hub import CURVE
 from sb3_fedguide.cli.run_folder import DEPLOYED, PARAMETERS
 from sb3_fedguide.common.digits import decimals
 
-#: The hub would offer SB3's own commands, which take pickled archives, for ``stable-baselines3``: that is among the tags.
+#: Not the library ``stable-baselines3``, which is a tag: for it the hub would offer SB3's commands, with pickled archives.
 LIBRARY = "sb3-fedguide"
 TAGS = ("reinforcement-learning", "deep-reinforcement-learning", "federated-learning", "stable-baselines3", LIBRARY)
-#: Which of the packages' versions the card names; ``versions.json`` has all.
+#: Packages whose versions the card names; ``versions.json`` has all.
 NAMED = ("sb3-fedguide", "stable-baselines3", "torch", "gymnasium", "mujoco")
 POLICIES = {"deployed": "as they left local training", "broadcast": "as the server sent them last"}
 
@@ -30,8 +30,8 @@ def write_card(folder: Path, repository: str, run: Mapping[str, Any], family: Fa
     :param repository: ``OWNER/NAME``
     :param run: its ``summary.json``
     :param family: its clients
-    :param packages: modules that have to be imported first
-    :raises ValueError: where the summary is damaged
+    :param packages: modules to import first
+    :raises ValueError: if the summary is damaged
     """
     try:
         returns = {policy: np.array(run[policy]["client_returns"], dtype=float) for policy in POLICIES if policy in run}
@@ -44,7 +44,7 @@ def write_card(folder: Path, repository: str, run: Mapping[str, Any], family: Fa
 def draw_curve(folder: Path, path: Path) -> None:
     """The run's learning curve as a picture.
 
-    :raises ValueError: where its evaluations are damaged
+    :raises ValueError: if its evaluations are damaged
     """
     from fed_envs.files import atomic_file
     from sb3_fedguide.benchmark.figures import layout
@@ -101,21 +101,21 @@ def _body(
         "",
         "```",
         "pip install 'sb3-fedguide[hub,onnx]'",
-        f"fedguide pull {repository}{modules}    # says where the run is: {there}, or the next free number",
+        f"fedguide pull {repository}{modules}    # prints the run's folder: {there}, or the next free number",
         f"fedguide evaluate {there}{modules}",
         f"fedguide export {there} --format sb3 onnx",
         f"fedguide train -i {there} --algo {algo} {clients}{modules}",
         "```",
         "",
-        "`fedguide export` makes ordinary policies, one of each client, which need this package no more.",
-        "`fedguide train` starts a new run from this one, whose network has to be that of `config.yml` "
+        "`fedguide export` makes ordinary policies, one per client, which do not need this package.",
+        "`fedguide train` starts a new run from this one; its network must be that of `config.yml` "
         "(`-params policy_kwargs.net_arch:[...]`).",
         "",
         "## Files",
         "",
-        f"`{PARAMETERS}` is what was learned, as plain arrays"
+        f"`{PARAMETERS}` has the learned parameters, as plain arrays"
         + (f", and `{DEPLOYED}` the policies before the last exchange" if (folder / DEPLOYED).is_file() else "")
-        + ". `config.yml` has all hyperparameters, `metadata.json` says who the clients are. Nothing here is pickled.",
+        + ". `config.yml` has all hyperparameters, `metadata.json` describes the clients. Nothing here is pickled.",
     ]
     if versions := _versions(folder):
         lines += ["", f"Trained with {versions}."]
@@ -123,7 +123,7 @@ def _body(
 
 
 def _returns(folder: Path, run: Mapping[str, Any], returns: Mapping[str, np.ndarray]) -> list[str]:
-    """A table with a row for each client, and the curve."""
+    """A table with a row for each client, and the learning curve."""
     if not returns:
         return ["This run was not evaluated.", ""]
     episodes = int(next(run[policy]["n_episodes"] for policy in returns))

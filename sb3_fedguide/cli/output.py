@@ -1,4 +1,4 @@
-"""A reader of the output that goes away, as in ``fedguide evaluate RUN | head``."""
+"""Handle a closed output pipe, as in ``fedguide evaluate RUN | head``."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ P = ParamSpec("P")
 
 
 def pipe_may_close(command: Callable[P, int]) -> Callable[P, int]:
-    """Let a command end without a word when nobody reads its output any more; its exit code is then 141, as of ``yes``."""
+    """Let a command end silently if its output pipe is closed; its exit code is then 141, as that of ``yes``."""
 
     @functools.wraps(command)
     def run(*args: P.args, **kwargs: P.kwargs) -> int:
         try:
             code = command(*args, **kwargs)
-            sys.stdout.flush()  # what waits in the buffer finds out here, and not while the interpreter ends
+            sys.stdout.flush()  # buffered output raises its error here, not at the interpreter's exit
             return code
         except BrokenPipeError:
             null = os.open(os.devnull, os.O_WRONLY)

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 #: Flags that mean the same as for ``fedguide benchmark``.
 SHARED = ("algos", "envs", "metadata", "seeds", "folder", "baseline", "gym_packages")
-#: Those that choose results of a benchmark, so that they say nothing about run folders.
+#: Flags that choose results of a benchmark, and do not apply to run folders.
 OF_BENCHMARK = ("algos", "metadata", "seeds", "label")
 FIGURES = ("curves", "bars", "cv", "clients", "aggregate", "speedup")
-#: Those that are drawn from folders of runs only, and only where they are asked for: from their logs, and from their policies.
+#: Figures that are drawn only from folders of runs, and only on request: from their logs, and from their policies.
 OF_LOGS, OF_POLICIES = ("lemma2", "theorem3"), ("rollouts", "plan")
 OF_FOLDERS = OF_LOGS + OF_POLICIES
-#: Flags of the learning curves, and what they are by default.
+#: Flags of the learning curves, and their defaults.
 OF_CURVES = {"x": "rounds", "of": "average", "band": "range"}
 
 Drawn = list[tuple[str, "Figure"]]
@@ -43,7 +43,7 @@ Drawn = list[tuple[str, "Figure"]]
 def main(argv: Sequence[str] | None = None, prog: str = "fedguide plot") -> int:
     """Run the command.
 
-    :return: the exit code: 0, 1 where a file could not be written, 2 for wrong input
+    :return: the exit code: 0, 1 if a file could not be written, 2 for wrong input
     """
     arguments = _parse(argv, prog)
     try:
@@ -79,34 +79,34 @@ def _parse(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
     for action in benchmark_parser(prog)._actions:
         if action.dest in SHARED:
             parser._add_action(action)
-    flag("--label", nargs="+", metavar="LABEL", help="names of the results; by default tuned; with several, methods are "
-         "called by their name and label")  # fmt: skip
+    flag("--label", nargs="+", metavar="LABEL", help="names of the results; by default tuned; with several, legends "
+         "show the method's name and label")  # fmt: skip
     flag(
         "--figures",
         nargs="+",
         metavar="FIGURE",
-        help=f"{', '.join(FIGURES)}; by default all that the data allow; and of run folders: lemma2, theorem3, "
-        "rollouts (an episode of each client), plan (who listens to whom, FedGuide)",
+        help=f"{', '.join(FIGURES)}; by default all that the data allow; and from run folders: lemma2, theorem3, "
+        "rollouts (an episode of each client), plan (FedGuide's transport plan)",
     )
-    flag("--clients", nargs="+", type=int, metavar="K", help="of rollouts: the clients to draw; by default all")
-    flag("-x", choices=("rounds", "steps", "seconds", "bytes"), help="what learning curves are drawn over; by default rounds")
-    flag("--of", choices=("average", "worst", "clients"), help="what learning curves show: the clients' average (default), "
-         "the worst client, or each client in a panel of its own")  # fmt: skip
-    flag("--band", choices=("range", "bootstrap"), help="of learning curves: from the lowest to the highest seed (default), "
+    flag("--clients", nargs="+", type=int, metavar="K", help="clients to draw in rollouts; by default all")
+    flag("-x", choices=("rounds", "steps", "seconds", "bytes"), help="x axis of learning curves; by default rounds")
+    flag("--of", choices=("average", "worst", "clients"), help="content of learning curves: the clients' average (default), "
+         "the worst client, or each client in its own panel")  # fmt: skip
+    flag("--band", choices=("range", "bootstrap"), help="band of learning curves: lowest to highest seed (default), "
          "or the 95 %% bootstrap interval of the mean over seeds")  # fmt: skip
     flag("-o", "--output", default="figures", metavar="DIR", help="folder to write to")
     for action in parser._actions:
         if action.dest in ("seeds", "folder", "baseline"):
             action.help = {
-                "seeds": "by default all that there are",
+                "seeds": "random seeds; by default all existing ones",
                 "folder": "results are in DIR/FAMILY-LABEL/ALGO-seedN.json; by default runs/benchmark",
-                "baseline": "method to compare with: its mean return scores 1, and is what counts for the speed-up",
+                "baseline": "method to compare with: its mean return has score 1, and is the target of the speed-up",
             }[action.dest]
     return parser.parse_strictly(argv)
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """:raises ValueError: for what the flags alone show to be wrong"""
+    """:raises ValueError: for errors that the flags alone show"""
     from sb3_fedguide.cli.run_folder import check_log_folder
 
     if importlib.util.find_spec("matplotlib") is None:
@@ -131,9 +131,9 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _read(arguments: argparse.Namespace, prog: str) -> tuple[Comparison, Callable[[str], float]]:
-    """The runs, and what random actions return on a family.
+    """The runs, and a family's return of random actions.
 
-    :raises ValueError: for anything that a user can put right
+    :raises ValueError: for anything that a user can correct
     """
     import_packages(arguments.gym_packages)
     if arguments.runs:
@@ -163,7 +163,7 @@ def _random_of(folder: Path) -> float:
 
 
 def _benchmark_flags(arguments: argparse.Namespace, label: str) -> list[str]:
-    """What ``fedguide benchmark`` is to be given for the same results: its checks are ours."""
+    """Flags of ``fedguide benchmark`` for the same results: we use its checks."""
     flags = ["--table-only", f"--label={label}"]
     for name in SHARED:
         value = getattr(arguments, name)
@@ -175,10 +175,10 @@ def _benchmark_flags(arguments: argparse.Namespace, label: str) -> list[str]:
 def drawable(
     comparison: Comparison, families: Mapping[str, Family], benchmark: argparse.Namespace, figures: Sequence[str] | None = None
 ) -> tuple[Drawn, list[str]]:
-    """Every figure that runs of a benchmark allow, and why the others are left out.
+    """Every figure that runs of a benchmark allow, and the reasons why the others are left out.
 
-    :param benchmark: its flags, of which the folder and the baseline count
-    :param figures: those to try; by default those of results
+    :param benchmark: its flags; only the folder and the baseline are used
+    :param figures: figures to try; by default those of results
     """
     from sb3_fedguide.cli.benchmark_results import random_level
 
@@ -198,18 +198,18 @@ def drawable(
 def _draw_all(
     arguments: argparse.Namespace, comparison: Comparison, random: Callable[[str], float]
 ) -> tuple[Drawn, list[str]]:
-    """Every figure that is asked for, or that the data allow; and why the others are left out.
+    """Every requested figure, or every figure that the data allow; and the reasons why the others are left out.
 
-    :raises ValueError: where a figure that is asked for cannot be drawn, or none can
+    :raises ValueError: if a requested figure, or no figure at all, can be drawn
     """
     asked = set(arguments.figures or ())
     if any(getattr(arguments, name) is not None for name in OF_CURVES):
-        asked.add("curves")  # its flags ask for it
+        asked.add("curves")  # its flags request it
     for name, default in OF_CURVES.items():
         if getattr(arguments, name) is None:
             setattr(arguments, name, default)
     drawn: Drawn = []
-    left_out = [f"{run.source} is not finished, and is drawn in learning curves only"
+    left_out = [f"{run.source} is not finished, and is drawn only in learning curves"
                 for runs in comparison.values() for group in runs.values() for run in group if run.result is None]  # fmt: skip
     for figure in arguments.figures or FIGURES:
         try:
@@ -226,7 +226,7 @@ def _draw_all(
 def _draw(
     figure: str, arguments: argparse.Namespace, comparison: Comparison, random: Callable[[str], float], notes: list[str]
 ) -> Drawn:
-    """:param notes: takes what is to be said about the figure"""
+    """:param notes: receives remarks about the figure"""
     from sb3_fedguide.benchmark.figures import bars, clients, curves
 
     if figure in OF_LOGS:
@@ -263,7 +263,7 @@ def _draw(
         raise ValueError("it needs finished runs on several families")
     from sb3_fedguide.benchmark.figures import aggregates  # PyTorch comes with it
 
-    complete = aggregates.complete_methods(comparison, arguments.baseline)  # before random actions are measured
+    complete = aggregates.complete_methods(comparison, arguments.baseline)  # before the measurement of random actions
     if partial := sorted({name for runs in comparison.values() for name in runs} - set(complete)):
         notes.append(f"aggregate is without {', '.join(partial)}: some families have no finished run")
     return [("aggregate", aggregates.draw_aggregate(comparison, {family: random(family) for family in comparison},

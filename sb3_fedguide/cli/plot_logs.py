@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from sb3_fedguide.benchmark.figures.theory import Log, Scalars
 
 ROUND = "time/round"
-#: Settings with which what the server sends is not the average of all clients' policies, and their values where it is.
+#: Settings with the value for which the server sends the plain average of all clients' policies.
 PLAIN = {"server_step": 1, "server_momentum": 0, "aggregator": "mean", "screening": 0, "client_fraction": 1}
 
 
 def read_logs(comparison: Comparison) -> list[Log]:
-    """What runs have logged.
+    """The logs of runs.
 
     :param comparison: runs from their folders
     :raises ValueError: for results of a benchmark, and for a folder without events
@@ -33,9 +33,9 @@ def read_logs(comparison: Comparison) -> list[Log]:
 
 
 def averages(comparison: Comparison) -> Comparison:
-    """The runs in which what is evaluated as the average is that of Theorem 3, of all clients' policies.
+    """The runs whose evaluated average is that of Theorem 3: the average of all clients' policies.
 
-    :raises ValueError: where there is none
+    :raises ValueError: if there is none
     """
     other = {run.source: reason for run in _all(comparison) if (reason := _not_the_average(run))}
     chosen = {
@@ -55,12 +55,12 @@ def _not_the_average(run: Run) -> str:
     settings = _settings(run.source, "config.yml")
     for name, value in PLAIN.items():
         if settings.get(name, value) != value:
-            return f"has {name} {settings[name]}: what its server sends is not the average of all policies"
+            return f"has {name} {settings[name]}: its server does not send the average of all policies"
     return "has delays: not all clients take part in a round" if _settings(run.source, "args.yml").get("delays") else ""
 
 
 def _settings(folder: Path, name: str) -> dict[str, Any]:
-    """:raises ValueError: where the file is missing or damaged"""
+    """:raises ValueError: if the file is missing or damaged"""
     content = read_yaml(folder / name)
     if not isinstance(content, dict):
         raise ValueError(f"{folder / name} is damaged: it is not a mapping")
@@ -70,7 +70,7 @@ def _settings(folder: Path, name: str) -> dict[str, Any]:
 def read_scalars(run: Run) -> Scalars:
     """Key of the log to round to value, of a run's folder.
 
-    :raises ValueError: where it has no events, or they do not count rounds
+    :raises ValueError: if it has no events, or they do not count rounds
     """
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

@@ -1,4 +1,4 @@
-"""Figures that are drawn from the folders of runs themselves: rollouts of their policies, and their transport plans."""
+"""Figures from the folders of runs: rollouts of their policies, and their transport plans."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ DRAWN = ("bandit2d", "point_maze")
 
 
 def rollouts(runs: Runs, clients: Sequence[int] | None = None) -> Figure:
-    """One episode of each client with the policies that it deploys, a row per method.
+    """One episode of each client with its deployed policy, a row per method.
 
     Of several seeds of a method, the one with the highest final return is drawn, as in the paper.
 
     :param runs: of one family, by method
     :param clients: to draw; all by default
-    :raises ValueError: for a run without its policies, for clients that there are not, and where nothing can be drawn
+    :raises ValueError: for a run without its policies, for unknown clients, and if nothing can be drawn
     """
     rows, family = [], None
     for name, group in runs.items():
@@ -73,9 +73,9 @@ def _cells(model: Federation, family: Family, clients: Sequence[int]) -> list[Ce
 
 
 def plans(comparison: Comparison, file_name: Callable[[str], str], notes: list[str]) -> list[tuple[str, Figure]]:
-    """Name and figure of every run that has a transport plan; ``notes`` takes who has none.
+    """Name and figure of every run with a transport plan; ``notes`` receives the runs without one.
 
-    :raises ValueError: where no run has one
+    :raises ValueError: if no run has one
     """
     drawn, without = [], []
     for family, runs in comparison.items():

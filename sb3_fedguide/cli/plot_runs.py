@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def read_benchmark(arguments: argparse.Namespace, families: Mapping[str, Family], labels: Sequence[str]) -> Comparison:
     """The results of ``fedguide benchmark`` under one label or several.
 
-    With several, a method is called by its name and label.
+    With several, a method's title is its name and label.
 
     :raises ValueError: for a family without results, a damaged file, and for results that cannot be compared
     """
@@ -74,9 +74,9 @@ def read_run_folders(folders: Sequence[str]) -> Comparison:
 
 
 def read_run_folder(folder: Path) -> Run:
-    """A run from its ``evaluations.csv``, with the measures of its ``summary.json`` where it is finished.
+    """A run from its ``evaluations.csv``, with the measures of its ``summary.json`` if it is finished.
 
-    :raises ValueError: where the folder is none of a run, or a file in it is damaged
+    :raises ValueError: if the folder is not that of a run, or a file in it is damaged
     """
     if not (folder / EVALUATIONS).is_file():
         raise ValueError(f"{folder} is not the folder of a run with evaluations: it has no {EVALUATIONS}")
@@ -101,7 +101,7 @@ def read_run_folder(folder: Path) -> Run:
 
 
 def _identity(folder: Path) -> tuple[dict[str, Any], Result | None]:
-    """Algorithm, family and seed; and the result, where the run is finished."""
+    """Algorithm, family and seed; and the result if the run is finished."""
     path = folder / "summary.json"
     try:
         if path.is_file():
@@ -110,7 +110,7 @@ def _identity(folder: Path) -> tuple[dict[str, Any], Result | None]:
             return {"algo": str(content["algo"]), "env": str(content["env"]), "seed": int(content["seed"])}, result
         from sb3_fedguide.settings.config import read_yaml
 
-        path = folder / "args.yml"  # a run that still goes on, or was killed
+        path = folder / "args.yml"  # of a run that is not finished, or was killed
         flags = read_yaml(path)
         path = folder / "metadata.json"
         family = json.loads(path.read_text(encoding="utf-8"))["family"]
@@ -123,9 +123,9 @@ def _identity(folder: Path) -> tuple[dict[str, Any], Result | None]:
 def read_evaluations(path: Path) -> tuple[np.ndarray, np.ndarray, list[int], np.ndarray]:
     """Rounds and environment steps, ``(n_evaluations,)``, clients' numbers, and returns, ``(n_evaluations, n_clients)``.
 
-    Those of the deployed policies. A last evaluation whose rows are not all there yet is left out.
+    Only of the deployed policies. An incomplete last evaluation is left out.
 
-    :raises ValueError: where the file is damaged, or has no complete evaluation
+    :raises ValueError: if the file is damaged, or has no complete evaluation
     """
     found: dict[int, tuple[int, dict[int, float]]] = {}
     try:
@@ -149,12 +149,12 @@ def read_evaluations(path: Path) -> tuple[np.ndarray, np.ndarray, list[int], np.
 
 
 def _check_clients(runs: Sequence[Run]) -> None:
-    """:raises ValueError: where runs on one family have other clients"""
+    """:raises ValueError: if runs on one family have different clients"""
     hashes = {run.source: _hash(run.source) for run in runs}
     for run in runs:
         if list(run.clients) != list(runs[0].clients) or hashes[run.source] != hashes[runs[0].source]:
             raise ValueError(
-                f"{run.source} and {runs[0].source} cannot stand in one figure: their clients of {run.family} differ"
+                f"{run.source} and {runs[0].source} cannot be in one figure: their clients of {run.family} differ"
             )
 
 

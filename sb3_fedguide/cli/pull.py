@@ -1,4 +1,4 @@
-"""The pull command: a run that somebody has shared on the Hugging Face hub, checked before it becomes a folder here."""
+"""The pull command: download a shared run from the Hugging Face hub, and check it before it becomes a folder here."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from sb3_fedguide.cli.hub import FILES, NEEDED, check_repository, check_run, hub
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
-#: Bytes that are read at a time, so that a longer answer than was announced ends soon.
+#: Bytes per read, so that an answer that is longer than announced is stopped soon.
 CHUNK = 65_536
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "fedguide pull") -> int:
     """Run the command.
 
-    :return: the exit code: 0, or 2 for wrong input, and where the hub does not answer
+    :return: the exit code: 0, or 2 for wrong input and if the hub does not answer
     """
     parser = _parser(prog)
     arguments = parser.parse_strictly(argv)
@@ -42,24 +42,24 @@ def _parser(prog: str) -> OneLineParser:
     flag("-f", "--folder", type=Path, default=Path("logs"), metavar="DIR", help="the run goes to DIR/ALGO/FAMILY_<number>; "
          "logs by default")  # fmt: skip
     flag("--revision", metavar="R", help="a branch, tag or commit; the newest by default")
-    flag("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first, which register algorithms "
-         "or environments of your own")  # fmt: skip
+    flag("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first; they register your own "
+         "algorithms or environments")  # fmt: skip
     return parser
 
 
 def load_from_hub(
     repository: str, folder: str | Path = "logs", revision: str | None = None, packages: Sequence[str] = ()
 ) -> Path:
-    """Fetch a run, check it, and write it; nothing of it is unpickled or imported, and nothing stays of what is refused.
+    """Download a run, check it, and write it; nothing of it is unpickled or imported, and no part of a refused run stays.
 
     :param repository: ``OWNER/NAME``
-    :param folder: the run goes to ``<folder>/<algo>/<family>_<number>``, the next that is free
+    :param folder: the run goes to ``<folder>/<algo>/<family>_<number>``, with the next free number
     :param revision: a branch, tag or commit; the newest by default
     :param packages: modules to import first, which register its algorithm or environments
     :return: the run's folder
-    :raises ValueError: where the hub has no such run or does not answer, and for files that are too large, damaged, or do not
+    :raises ValueError: if the hub has no such run or does not answer, and for files that are too large, damaged, or do not
         belong together
-    :raises OSError: where it cannot be written
+    :raises OSError: if it cannot be written
     """
     from sb3_fedguide.cli.run_folder import check_log_folder, create_run_folder
 
@@ -84,25 +84,25 @@ def load_from_hub(
 
 
 def _fetch(api: HfApi, repository: str, revision: str | None, folder: Path) -> None:
-    """Those of the repository's files that are a run's, all of one commit.
+    """Download the repository's files of a run, all of one commit.
 
-    :raises ValueError: where one is missing, or larger than it may be
+    :raises ValueError: if one is missing or too large
     """
     with hub_answers(api):
         commit = api.model_info(repository, revision=revision, expand=["sha"]).sha
         found = {file.path: int(file.size) for file in api.get_paths_info(repository, list(FILES), revision=commit)
                  if hasattr(file, "size")}  # fmt: skip
     if missing := [name for name in NEEDED if name not in found]:
-        raise ValueError(f"{repository} is no run that 'fedguide push' sent: it has no {missing[0]}")
-    for name, bound in FILES.items():  # whatever else the answer names is left alone
+        raise ValueError(f"{repository} is not a run from 'fedguide push': it has no {missing[0]}")
+    for name, bound in FILES.items():  # other files of the answer are ignored
         if name in found:
             if found[name] > bound:
-                raise ValueError(f"{name} of {repository} has {found[name]} bytes; at most {bound} are taken")
+                raise ValueError(f"{name} of {repository} has {found[name]} bytes; the limit is {bound}")
             _download(api, repository, str(commit), name, folder / name)
 
 
 def _download(api: HfApi, repository: str, commit: str, name: str, path: Path) -> None:
-    """:raises ValueError: if the file is longer than it may be, whatever its size was said to be"""
+    """:raises ValueError: if the file is too long, whatever its announced size"""
     from huggingface_hub import get_session, hf_hub_url
     from huggingface_hub.utils import build_hf_headers, hf_raise_for_status
 
@@ -115,5 +115,5 @@ def _download(api: HfApi, repository: str, commit: str, name: str, path: Path) -
         for chunk in response.iter_bytes(CHUNK):
             n_bytes += len(chunk)
             if n_bytes > FILES[name]:
-                raise ValueError(f"{name} of {repository} is longer than the {FILES[name]} bytes that are taken")
+                raise ValueError(f"{name} of {repository} is longer than the limit of {FILES[name]} bytes")
             file.write(chunk)

@@ -1,4 +1,4 @@
-"""The push command: a finished run to the Hugging Face hub, as plain arrays and texts with a model card; no pickle."""
+"""The push command: upload a finished run to the Hugging Face hub, as plain arrays and texts with a model card; no pickle."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 def main(argv: Sequence[str] | None = None, prog: str = "fedguide push") -> int:
     """Run the command.
 
-    :return: the exit code: 0, or 2 for wrong input, and where the hub does not answer
+    :return: the exit code: 0, or 2 for wrong input and if the hub does not answer
     """
     parser = _parser(prog)
     arguments = parser.parse_strictly(argv)
@@ -48,11 +48,11 @@ def _parser(prog: str) -> OneLineParser:
     parser = OneLineParser(prog=prog, description=__doc__)
     flag = parser.add_argument
     flag("run", metavar="RUN", type=Path, help="folder of a run, e.g. logs/fedguide/HopperHard_1")
-    flag("repository", metavar="OWNER/NAME", help="where it goes on the hub; made if there is none")
-    flag("--private", action="store_true", help="only you and those whom you let in can see it")
-    flag("-m", "--message", metavar="TEXT", help="of the commit; by default method, family and rounds")
-    flag("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first, which register algorithms "
-         "or environments of your own")  # fmt: skip
+    flag("repository", metavar="OWNER/NAME", help="repository on the hub; made if there is none")
+    flag("--private", action="store_true", help="only you and people with your permission can see it")
+    flag("-m", "--message", metavar="TEXT", help="commit message; by default method, family and rounds")
+    flag("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules to import first; they register your own "
+         "algorithms or environments")  # fmt: skip
     return parser
 
 
@@ -63,20 +63,20 @@ def push_to_hub(
     message: str | None = None,
     packages: Sequence[str] = (),
 ) -> str:
-    """Send a run: its parameters, settings, clients' metadata, evaluations, and a card that says what it is.
+    """Upload a run: its parameters, settings, clients' metadata, evaluations, and a model card.
 
     :param folder: of the run
     :param repository: ``OWNER/NAME``
-    :param private: whether a repository that is made for it is
+    :param private: whether a new repository is private
     :param message: of the commit
     :param packages: modules to import first, which register its algorithm or environments
     :return: the address of the repository
-    :raises ValueError: for a folder of something else, for what 'fedguide pull' would refuse, and where the hub refuses or
+    :raises ValueError: for a folder of something else, for a run that 'fedguide pull' would refuse, and if the hub refuses or
         does not answer
     """
     check_repository(repository)
     if message is not None and not message.strip():
-        raise ValueError("-m: the message is empty; leave it out for one that names method and family")
+        raise ValueError("-m: the message is empty; leave it out for the default, which names method and family")
     api = hub_api()
     from huggingface_hub import get_token
 
@@ -102,9 +102,9 @@ def _collect(
     family: Family,
     packages: Sequence[str],
 ) -> None:
-    """Exactly the files that are to be sent, in a folder of their own.
+    """Exactly the files to upload, in their own folder.
 
-    :raises ValueError: where one is larger than anybody would take
+    :raises ValueError: if one is larger than 'fedguide pull' accepts
     """
     from sb3_fedguide.cli.model_card import draw_curve, write_card
 
@@ -117,11 +117,13 @@ def _collect(
     write_text(part / CARD, write_card(part, repository, run, family, packages))
     for path in part.iterdir():
         if path.stat().st_size > FILES[path.name]:
-            raise ValueError(f"{path.name} has {path.stat().st_size} bytes; 'fedguide pull' takes {FILES[path.name]}")
+            raise ValueError(
+                f"{path.name} has {path.stat().st_size} bytes; the limit of 'fedguide pull' is {FILES[path.name]}"
+            )
 
 
 def _without_paths(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings with the mere name of a data set that lies in a folder here: the path is nobody's business."""
+    """The settings, with only the name of a local dataset's folder: the path stays private."""
     offline = dict(values["pretraining"])
     if offline["dataset"] is not None and Path(offline["dataset"]).is_absolute():
         offline["dataset"] = Path(offline["dataset"]).name
@@ -129,7 +131,7 @@ def _without_paths(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _send(api: HfApi, repository: str, folder: Path, private: bool, message: str) -> str:
-    """One commit with the run's files; those of an earlier run that this one has not are removed."""
+    """One commit with the run's files; files of an earlier run that this one does not have are removed."""
     from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
     with hub_answers(api):
@@ -137,7 +139,7 @@ def _send(api: HfApi, repository: str, folder: Path, private: bool, message: str
         hidden = private and api.model_info(repository, expand=["private"]).private
         there = {file.path for file in api.get_paths_info(repository, list(FILES))}
     if private and not hidden:
-        raise ValueError(f"{repository} is there already and not private; make it so on {url}, or leave --private out")
+        raise ValueError(f"{repository} exists already and is not private; make it private on {url}, or leave --private out")
     sent = sorted(path.name for path in folder.iterdir())
     changes: list[CommitOperationAdd | CommitOperationDelete] = [
         *(CommitOperationAdd(name, folder / name) for name in sent),

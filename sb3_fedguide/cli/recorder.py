@@ -1,4 +1,4 @@
-"""Callbacks of a run on the command line: what it cost, and the course of its evaluations."""
+"""Callbacks of a run on the command line: its costs, and its evaluations over rounds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TIMES = ("rollout", "train", "exchange")
 
 
 class CostCallback(RoundCallback):
-    """Adds up seconds by part of a round and the bytes that the exchange carried."""
+    """Adds up seconds by part of a round, and the bytes of the exchange."""
 
     state_attributes = ("seconds", "round_seconds", "pretraining_seconds", "total_seconds", "rejected")
 
@@ -33,7 +33,7 @@ class CostCallback(RoundCallback):
 
     @property
     def total_seconds(self) -> float:
-        """Since the callback was made, and in earlier parts of a run that was resumed."""
+        """Seconds since the callback was made, and in earlier parts of a resumed run."""
         return self._earlier_seconds + time.perf_counter() - self._began
 
     @total_seconds.setter
@@ -42,7 +42,7 @@ class CostCallback(RoundCallback):
 
     @property
     def n_bytes(self) -> dict[str, int]:
-        """What all clients together sent and received, and what of it was before the first round."""
+        """Bytes that all clients together sent and received, and the part of them before the first round."""
         names = ("bytes_up", "bytes_down", "offline_bytes_up", "offline_bytes_down")
         return {name: 0 if self._exchange is None else getattr(self._exchange.server, name) for name in names}
 
@@ -62,7 +62,7 @@ class CostCallback(RoundCallback):
 
 
 class DeployedCallback(RoundCallback):
-    """Remembers the policies as they left local training: the exchange may replace them before the model is saved."""
+    """Remembers the policies after local training: the exchange may replace them before the model is saved."""
 
     state_attributes = ("_state",)
 
@@ -74,14 +74,14 @@ class DeployedCallback(RoundCallback):
         self._state = self.model.acting_arrays()
 
     def replaced(self) -> dict[str, np.ndarray]:
-        """The deployed policies' parameters where they differ from the model's own, else nothing."""
+        """The deployed policies' parameters if they differ from the model's own, else nothing."""
         now = self.model.acting_arrays()
         same = all(np.array_equal(array, now[name]) for name, array in self._state.items())
         return {} if same else self._state
 
 
 class StopCallback(RoundCallback):
-    """Ends the training after the round in which a signal came, with a checkpoint where there are checkpoints."""
+    """Ends the training after the round in which a signal came, with a checkpoint if checkpoints are on."""
 
     def __init__(self, signals: StopSignals, checkpoint: CheckpointCallback | None) -> None:
         super().__init__()
@@ -102,7 +102,7 @@ class StopCallback(RoundCallback):
 
 
 class RunEvalCallback(FederatedEvalCallback):
-    """Keeps the average return of every evaluation, and the seconds they took."""
+    """Keeps the average return of every evaluation, and the seconds of all evaluations."""
 
     state_attributes = ("seconds", "curves", "client_curves")
 

@@ -1,4 +1,4 @@
-"""Whether pictures of environments can be drawn here, said before anything is trained or evaluated for them."""
+"""Check that pictures of environments can be drawn here, before any training or evaluation for them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ REMEDY = "set MUJOCO_GL=osmesa (Debian: libosmesa6) or MUJOCO_GL=egl"
 
 
 def check_rendering(family: Family, flag: str) -> None:
-    """:raises ValueError: where nothing can be drawn; ``flag`` is what asks for it"""
+    """:raises ValueError: if nothing can be drawn; ``flag`` is the flag that requests it"""
     env = family.make(family.clients[0].client)
     modes = env.metadata.get("render_modes", [])
     env.close()

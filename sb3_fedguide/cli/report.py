@@ -1,4 +1,4 @@
-"""What a run ends with: ``summary.json`` and a table on the terminal."""
+"""The summary of a run: ``summary.json`` and a table on the terminal."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def summarize(
     total_seconds: float,
     **identity: Any,
 ) -> dict[str, Any]:
-    """One run in a page of plain data: who, how long, how good, and how much was communicated.
+    """One run in a page of plain data: clients, length, returns, and communication.
 
-    :param identity: what else identifies the run, such as its algorithm
+    :param identity: other entries that identify the run, such as its algorithm
     """
     evaluated = evaluation.last if evaluation is not None else {}
     evaluating = evaluation.seconds if evaluation is not None else 0.0
@@ -108,7 +108,7 @@ def print_summary(summary: dict[str, Any], folder: str) -> None:
 
 
 def describe_privacy(privacy: dict[str, Any]) -> str:
-    """What the uploads of a run have spent, in a line."""
+    """The privacy spent by a run's uploads, in a line."""
     clipping = f"{privacy['clipped']:.0%} clipped to {privacy['clipping_norm']:g}"
     if "epsilon" not in privacy:
         return f"privacy none: uploads without noise, {clipping}"
@@ -117,7 +117,7 @@ def describe_privacy(privacy: dict[str, Any]) -> str:
 
 
 def format_size(n_bytes: float) -> str:
-    """Bytes, readable."""
+    """Bytes in a readable unit."""
     for unit in ("B", "kB", "MB"):
         if n_bytes < 1000:
             return f"{n_bytes:.0f} {unit}" if unit == "B" else f"{n_bytes:.1f} {unit}"

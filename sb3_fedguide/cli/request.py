@@ -1,7 +1,7 @@
-"""What a training command asks for, resolved once: its clients, its hyperparameters, its simulated delays.
+"""The request of a training command, resolved once: its clients, its hyperparameters, its simulated delays.
 
-Whatever goes on with a command (a run, a benchmark's list of runs, a trial) takes the result; nothing of it is parsed or read
-again. Neither PyTorch nor the simulator is imported for that, but for an algorithm of the user's own.
+All users of a command (a run, a benchmark's list of runs, a trial) take the result; nothing of it is parsed or read
+again. This imports neither PyTorch nor the simulator, except for a user's own algorithm.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ ID_PREFIX, ID_SUFFIX = "fed_envs/", "-v0"
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be trained, how.
+    """The algorithm and all settings of a training.
 
-    :param arguments: the flags, as ``args.yml`` keeps them
+    :param arguments: the flags, as in ``args.yml``
     :param config: every hyperparameter, checked
-    :param delays: to be simulated; ``None`` for none
-    :param overrides: the hyperparameters that the command itself states, by flags or ``-params``
+    :param delays: to simulate; ``None`` for none
+    :param overrides: the hyperparameters from the command itself, by flags or ``-params``
     """
 
     arguments: argparse.Namespace
@@ -43,10 +43,10 @@ class Request:
 
 
 def resolve_request(arguments: argparse.Namespace, family: Family) -> Request:
-    """Check what the flags, and the files that they name, ask for, and fill in the rest.
+    """Check the flags and the files that they name, and fill in the rest.
 
-    :param family: what :func:`find_family` found
-    :raises ValueError: for anything that a user can put right
+    :param family: from :func:`find_family`
+    :raises ValueError: for anything that a user can correct
     """
     from sb3_fedguide.cli.delays import read_delays
     from sb3_fedguide.cli.run_folder import check_log_folder, parameter_file
@@ -71,7 +71,7 @@ def resolve_request(arguments: argparse.Namespace, family: Family) -> Request:
 
 
 def find_family(arguments: argparse.Namespace) -> Family:
-    """The clients that ``--env`` or ``--metadata`` mean.
+    """The clients of ``--env`` or ``--metadata``.
 
     :raises ValueError: for an unknown family, a wrong file, or two that do not belong together
     """
@@ -113,7 +113,7 @@ def check_tracker(name: str | None) -> None:
 def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     """Hyperparameters given on the command line, flags included.
 
-    :raises ValueError: where two of them say the same thing
+    :raises ValueError: if two of them set the same hyperparameter
     """
     from sb3_fedguide.settings.config import parse_params
 
@@ -129,10 +129,10 @@ def _overrides(arguments: argparse.Namespace) -> dict[str, Any]:
                 raise ValueError(f"{flag} and -params {name} set the same thing; give one of them")
             given[name] = value
     if arguments.n_timesteps is not None and "n_rounds" in given:
-        raise ValueError("-n/--n-timesteps and -params n_rounds both say how long to train; give one of them")
+        raise ValueError("-n/--n-timesteps and -params n_rounds both set the length; give one of them")
     return given
 
 
 def settings_entry(env: str | None) -> str | None:
-    """The entry of a configuration file that ``--env`` asks for; ``None`` for that of the family."""
+    """The entry of a configuration file for ``--env``; ``None`` for that of the family."""
     return None if env is None else env.removeprefix(ID_PREFIX).removesuffix(ID_SUFFIX)

@@ -1,4 +1,4 @@
-"""Going on with a run that was stopped: its own settings, its newest checkpoint, its own files."""
+"""Resume a run: its own settings, its newest checkpoint, its own files."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from fed_envs import Family
     from sb3_fedguide.settings.config import Config
 
-#: Flags that change nothing in what a run computes, so that they may differ from the run's own.
+#: Flags that do not change a run's results, so that they may differ from the run's own.
 FREE = ("verbose", "progress", "save_freq", "picture_freq", "num_threads", "cache_dir", "gym_packages", "resume", "engine",
         "num_actors", "ray_address", "track", "track_project")  # fmt: skip
 
 PATHS = ("log_folder", "tensorboard_log", "metadata", "client_kwargs")
 
-#: Flags that may make a run longer than it was to be.
+#: Flags that may make a run longer.
 LENGTH = ("rounds", "n_timesteps")
 
 
 def given_flags(argv: Sequence[str] | None, prog: str) -> dict[str, Any]:
-    """Those that stand on the command line, by the names that they have in ``args.yml``."""
+    """The flags on the command line, by their names in ``args.yml``."""
     parser = train_parser(prog)
     for action in parser._actions:
         action.default = argparse.SUPPRESS
@@ -38,9 +38,9 @@ def given_flags(argv: Sequence[str] | None, prog: str) -> dict[str, Any]:
 
 
 def read_arguments(folder: Path, given: Mapping[str, Any], prog: str) -> argparse.Namespace:
-    """The flags that a run was started with, and those that are given now and are free.
+    """The flags with which a run was started, and the free ones that are given now.
 
-    :raises ValueError: if ``folder`` is none of a run, or a given flag contradicts the run's own
+    :raises ValueError: if ``folder`` is not that of a run, or a given flag contradicts the run's own
     """
     saved = _read_yaml(folder, "args.yml")
     parser = train_parser(prog)
@@ -98,7 +98,7 @@ def _read_yaml(folder: Path, name: str) -> dict[str, Any]:
 
     if not (folder / name).is_file():
         raise ValueError(
-            f"{folder} is no folder of a run that can go on: it has no {name}; give one such as logs/fedguide/HopperHard_1"
+            f"{folder} is not the folder of a run to resume: it has no {name}; give one such as logs/fedguide/HopperHard_1"
         )
     content = read_yaml(folder / name)
     if not isinstance(content, dict):
@@ -109,7 +109,7 @@ def _read_yaml(folder: Path, name: str) -> dict[str, Any]:
 def read_settings(folder: Path, algo: str) -> tuple[Config, Family]:
     """A run's own hyperparameters and clients.
 
-    :raises ValueError: where one of its files is missing or damaged
+    :raises ValueError: if one of its files is missing or damaged
     """
     from fed_envs.metadata import read_family
     from sb3_fedguide.settings.config import Config, complete
@@ -120,12 +120,12 @@ def read_settings(folder: Path, algo: str) -> tuple[Config, Family]:
     except ValueError as error:
         raise ValueError(f"{folder / 'config.yml'}: {error}") from None
     if not (folder / "metadata.json").is_file():
-        raise ValueError(f"{folder} is no folder of a run that can go on: it has no metadata.json")
+        raise ValueError(f"{folder} is not the folder of a run to resume: it has no metadata.json")
     return config, read_family(folder / "metadata.json")
 
 
 def with_length(config: Config, family: Family, given: Mapping[str, Any]) -> Config:
-    """The run's settings with the length that is given now, if one is."""
+    """The run's settings with the new length, if one is given."""
     from sb3_fedguide.settings.config import rounds_of
 
     n_rounds = given.get("rounds")
@@ -135,21 +135,21 @@ def with_length(config: Config, family: Family, given: Mapping[str, Any]) -> Con
 
 
 def check_length(folder: Path, config: Config, done: int) -> None:
-    """:raises ValueError: where the run has had more rounds than it is to have, or cannot have more"""
+    """:raises ValueError: if the run has already more rounds than the new length, or cannot have more"""
     from sb3_fedguide.cli.run_folder import CHECKPOINTS
     from sb3_fedguide.state.checkpoint_files import checkpoints
 
     if config.n_rounds < done:
-        raise ValueError(f"the run in {folder} has had {done} rounds, so it cannot be one of {config.n_rounds}")
+        raise ValueError(f"the run in {folder} has done {done} rounds, so its length cannot be {config.n_rounds}")
     if config.n_rounds > done and not checkpoints(folder / CHECKPOINTS):
         raise ValueError(
-            f"the run in {folder} has had its {done} rounds and has no checkpoint to go on from; start a new run from what it "
-            f"has learned with -i {folder}"
+            f"the run in {folder} has done its {done} rounds and has no checkpoint to resume from; start a new run from its "
+            f"parameters with -i {folder}"
         )
 
 
 def finished_rounds(folder: Path) -> int | None:
-    """How many rounds a run has had that came to its end; ``None`` for another."""
+    """Number of rounds of a finished run; ``None`` for an unfinished one."""
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         return int(summary["rounds_done"]) if summary["finished"] else None
@@ -158,7 +158,7 @@ def finished_rounds(folder: Path) -> int | None:
 
 
 def load_checkpoint(folder: Path, load: Callable[[Path], Any], prog: str) -> bool:
-    """Hand the folder of checkpoints to ``load``; where there are none, make the run begin from the beginning.
+    """Pass the folder of checkpoints to ``load``; if there are none, the run begins from the beginning.
 
     :return: whether there was one
     :raises ValueError: if none can be read
@@ -180,7 +180,7 @@ def load_checkpoint(folder: Path, load: Callable[[Path], Any], prog: str) -> boo
     except (OSError, ValueError, AttributeError):
         changed = []
     if changed:
-        messages.append(f"the run began with {', '.join(changed)}; its results may differ from those without interruption")
+        messages.append(f"the run began with {', '.join(changed)}; its results may differ from those of an uninterrupted run")
     for message in messages:
         print(f"{prog}: warning: {message}", file=sys.stderr)
     return True

@@ -1,4 +1,4 @@
-"""Each round's log on the terminal: what all clients together have reached first, then client by client."""
+"""Each round's log on the terminal: first the results of all clients together, then client by client."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ LARGE = 1000.0
 
 
 class RoundTable(HumanOutputFormat):
-    """SB3's table, which sorts by key, as two: a federation's clients would stand above its results, a page of them."""
+    """SB3's table, split in two: it sorts by key, and would show a page of clients above the federation's results."""
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        """Of one round."""
+        """Write the tables of one round."""
         for of_client in (False, True):
             keys = [key for key in key_values if bool(re.match(r"client_\d+/", key)) == of_client]
             if any(not {"stdout", "log"} & set(key_excluded[key] or ()) for key in keys):

@@ -1,4 +1,4 @@
-"""One run: its folder, its log, its training, and what is written at its end."""
+"""One run: its folder, its log, its training, and its results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LONGEST_MESSAGE = 2000
 
 
 class Run:
-    """A run whose inputs are all known to be sound; calling it trains."""
+    """A run with checked inputs; calling it trains."""
 
     def __init__(
         self,
@@ -33,11 +33,11 @@ class Run:
         folder: Path | None = None,
         longer: bool = False,
     ) -> None:
-        """:param folder: where the run is, if it goes on
-        :param longer: whether it is then to have other rounds than it was to have
+        """:param folder: of the run, if it is resumed
+        :param longer: whether it then gets a new number of rounds
         """
         self.folder, self.longer = folder, longer
-        #: what keeps other processes out of that folder
+        #: lock against other processes in that folder
         self.lock = ExitStack()
         self.arguments, self.config, self.family = request.arguments, request.config, request.family
         self.command, self.model = command, model
@@ -66,7 +66,7 @@ class Run:
         arguments, model = self.arguments, self.model
         self._set_logger(folder)
         if arguments.verbose:
-            begun = f", going on after round {model.round}" if self.folder is not None else ""
+            begun = f", resuming after round {model.round}" if self.folder is not None else ""
             print(f"{arguments.algo} on {self.family.name}: {model.n_clients} clients, {self.config.n_rounds} rounds, "
                   f"writing to {folder}{begun}", flush=True)  # fmt: skip
         exit_code, signals = 0, StopSignals()
@@ -103,14 +103,16 @@ class Run:
         return exit_code
 
     def _what_stays(self, folder: Path) -> str:
-        return f"what there is stays in {folder}, and --resume {folder} goes on with it"
+        return f"the results so far stay in {folder}, and --resume {folder} resumes the run"
 
     def _record_inputs(self, folder: Path) -> None:
         from sb3_fedguide.cli.run_folder import versions, write_json, write_text, write_yaml
 
         write_yaml(folder / "config.yml", self.config.values)
         events = self.arguments.tensorboard_log
-        tensorboard_log = None if events is None else str(Path(events).absolute())  # a run may go on from another folder
+        tensorboard_log = (
+            None if events is None else str(Path(events).absolute())
+        )  # a run may be resumed from another working directory
         arguments = {**vars(self.arguments), "seed": self.model.seed, "tensorboard_log": tensorboard_log}
         write_yaml(folder / "args.yml", arguments)
         write_text(folder / "command.txt", self.command + "\n")
@@ -119,7 +121,7 @@ class Run:
         write_text(folder / "metadata.sha256", self.family.content_hash + "\n")
 
     def _record_length(self, folder: Path) -> None:
-        """A run that goes on may be longer than it was to be, also when it goes on once more."""
+        """Write the new length of a resumed run, for further resumes too."""
         from sb3_fedguide.cli.run_folder import write_yaml
         from sb3_fedguide.settings.config import read_yaml
 
@@ -235,7 +237,7 @@ class Run:
 
 
 def forget_later_events(output: TensorBoardOutputFormat, timesteps: int) -> None:
-    """Tell TensorBoard that a run goes on from ``timesteps``: what its earlier files hold of later steps is hidden."""
+    """Tell TensorBoard that a run is resumed from ``timesteps``: it hides events of later steps in earlier files."""
     from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
     start = Event(step=timesteps + 1, session_log=SessionLog(status=SessionLog.START))
@@ -243,11 +245,11 @@ def forget_later_events(output: TensorBoardOutputFormat, timesteps: int) -> None
 
 
 class OfflineStageError(Exception):
-    """Something in the offline stage that the user can put right, such as a dataset that cannot be read."""
+    """An error in the offline stage that the user can correct, such as a dataset that cannot be read."""
 
 
 def one_message(error: Exception) -> str:
-    """An error's message with its lines indented below the first; of what is too long to be read, beginning and end."""
+    """An error's message with its lines indented below the first; only beginning and end of a very long one."""
     message = str(error)
     if len(message) > LONGEST_MESSAGE:
         half = LONGEST_MESSAGE // 2

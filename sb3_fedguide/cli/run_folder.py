@@ -1,4 +1,4 @@
-"""The folder of one run: what was asked for, with which versions, on whose data, and what came out."""
+"""The folder of one run: its settings, versions, clients and results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import yaml
 if TYPE_CHECKING:
     import numpy as np
 
-#: What the federation has learned, as plain arrays: see :meth:`Federation.export_parameters`.
+#: The federation's learned parameters, as plain arrays: see :meth:`Federation.export_parameters`.
 PARAMETERS = "parameters.npz"
 #: Parameters of the policies before the last exchange.
 DEPLOYED = "deployed.npz"
@@ -25,7 +25,7 @@ CHECKPOINTS = "checkpoints"
 EVALUATIONS = "evaluations.csv"
 #: The transport plan of each round, of methods that have one: see :mod:`sb3_fedguide.monitoring.plan`.
 PLAN = "plan.csv"
-#: The stage of a run that is under way: see :mod:`sb3_fedguide.cli.status`.
+#: The stage of a running run: see :mod:`sb3_fedguide.cli.status`.
 STATUS = "status.json"
 PACKAGES = (
     "sb3-fedguide", "stable-baselines3", "gymnasium", "gymnasium-robotics", "metaworld", "mujoco", "torch", "numpy", "scipy",
@@ -43,7 +43,7 @@ def check_log_folder(folder: Path, what: str = "log folder", flag: str = "-f") -
 
 
 def create_run_folder(log_folder: Path, algo: str, family: str) -> Path:
-    """``<log_folder>/<algo>/<family>_<n>`` with the next free number, claimed by its creation."""
+    """Create ``<log_folder>/<algo>/<family>_<n>`` with the next free number."""
     parent = log_folder / algo
     parent.mkdir(parents=True, exist_ok=True)
     pattern = re.compile(rf"{re.escape(family)}_(\d+)")
@@ -59,12 +59,12 @@ def create_run_folder(log_folder: Path, algo: str, family: str) -> Path:
 
 
 def events_folder(folder: Path, tensorboard_log: str | None, family: str, algo: str) -> Path:
-    """Where the TensorBoard events of the run in ``folder`` are.
+    """The folder of TensorBoard events of the run in ``folder``.
 
-    TensorBoard calls a run by the folder of its events, so they lie in the run's own. Those of an earlier version lie in its
-    ``tb``, and go on there.
+    TensorBoard names a run by the folder of its events, so they are in the run's own. Runs of an earlier version have them in
+    ``tb``, and continue there.
 
-    :param tensorboard_log: the folder that ``--tensorboard-log`` has named
+    :param tensorboard_log: the folder from ``--tensorboard-log``
     """
     if tensorboard_log is not None:
         return Path(tensorboard_log) / family / f"{algo}_{folder.name.rsplit('_', 1)[-1]}"
@@ -72,7 +72,7 @@ def events_folder(folder: Path, tensorboard_log: str | None, family: str, algo: 
 
 
 def parameter_file(trained: str) -> Path:
-    """The file of what a run has learned, from its folder or its own path.
+    """A run's parameter file, from its folder or the file's own path.
 
     :raises ValueError: if there is none
     """
@@ -82,7 +82,7 @@ def parameter_file(trained: str) -> Path:
     path = path / PARAMETERS if path.is_dir() else path
     if path.suffix == ".zip":
         raise ValueError(
-            f"-i {trained}: SB3's archive would be unpickled, which can execute anything; give the run's folder, or the "
+            f"-i {trained}: SB3's archive would be unpickled, which can execute any code; give the run's folder, or the "
             f"{PARAMETERS} beside it (in Python, export_parameters() of the loaded model writes one)"
         )
     if not path.is_file():
@@ -93,10 +93,10 @@ def parameter_file(trained: str) -> Path:
 
 @contextmanager
 def exclusive(folder: Path, wait: bool = False) -> Iterator[None]:
-    """Nobody else writes to this run's folder meanwhile; the system takes the lock back from a process that dies.
+    """Lock this run's folder against other processes; the system releases the lock of a process that dies.
 
-    :param wait: until a process that does is ready
-    :raises ValueError: if a process does
+    :param wait: wait until the other process releases the lock
+    :raises ValueError: if another process has the lock
     """
     try:
         import fcntl
@@ -115,7 +115,7 @@ def exclusive(folder: Path, wait: bool = False) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """The file appears complete or not at all."""
+    """Write a file that appears complete or not at all."""
     from fed_envs.files import atomic_file
 
     with atomic_file(path) as file:
@@ -131,14 +131,14 @@ def write_yaml(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def write_deployed(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """The policies that the clients deploy, as plain arrays beside the saved model; complete or not at all."""
+    """Write the deployed policies as plain arrays beside the saved model; complete or not at all."""
     from sb3_fedguide.state.array_files import write_arrays
 
     write_arrays(folder / DEPLOYED, arrays)
 
 
 def read_deployed(folder: Path) -> dict[str, np.ndarray]:
-    """What :func:`write_deployed` wrote; nothing where the saved model's policies are the deployed ones.
+    """Read a file of :func:`write_deployed`; empty if the saved model's policies are the deployed ones.
 
     :raises ValueError: if the file is damaged
     """
@@ -148,7 +148,7 @@ def read_deployed(folder: Path) -> dict[str, np.ndarray]:
 
 
 def versions() -> dict[str, str]:
-    """Of Python and the packages that decide what a run computes."""
+    """Versions of Python and of the packages that determine a run's results."""
     found = {"python": platform.python_version(), "platform": platform.platform()}
     for package in PACKAGES:
         try:

@@ -1,4 +1,4 @@
-"""A run that has been trained, from its folder: nothing in it is unpickled."""
+"""A trained run, from its folder: nothing in it is unpickled."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def read_run(folder: Path) -> tuple[dict[str, Any], Config, Family]:
     """``summary.json``, the hyperparameters and the family of a run folder.
 
-    :raises ValueError: if the folder is none of a run that was trained
+    :raises ValueError: if the folder is not that of a trained run
     """
     from sb3_fedguide.cli.resume import read_settings
     from sb3_fedguide.cli.run_folder import PARAMETERS
@@ -41,14 +41,14 @@ def read_run(folder: Path) -> tuple[dict[str, Any], Config, Family]:
 
 
 def _remedy(folder: Path, missing: str) -> str:
-    """What to do: about no folder, a deployed client's, and runs of earlier versions, which kept SB3's archive only."""
+    """The remedy for a missing folder, a deployed client's folder, and runs of earlier versions, with only SB3's archive."""
     from sb3_fedguide.cli.pretrained import no_such_run
     from sb3_fedguide.deployment.site import PARAMETERS, SITE
 
     if not folder.exists():
         return no_such_run(folder)
     if missing == "summary.json" and any((place / PARAMETERS).is_file() for place in (folder, folder / SITE)):
-        return "; it is a deployed client's, of whose policy 'fedguide export' makes an ordinary one to evaluate"
+        return "; it is a deployed client's folder: 'fedguide export' makes an ordinary policy from it, to evaluate"
     if missing != "parameters.npz" or not (folder / "model.zip").is_file():
         return ""
     return (
@@ -58,7 +58,7 @@ def _remedy(folder: Path, missing: str) -> str:
 
 
 def load_model(folder: Path, config: Config, family: Family) -> Federation:
-    """The run's model from its settings and arrays; SB3's archive beside them, which would be unpickled, is left alone.
+    """The run's model from its settings and arrays; SB3's archive, which would be unpickled, is not read.
 
     :raises ValueError: if the two do not belong together, or a client's environment cannot be made
     """
@@ -71,7 +71,7 @@ def load_model(folder: Path, config: Config, family: Family) -> Federation:
     th.set_num_threads(1)
     try:
         env = FederatedVecEnv(family, config.values["n_envs_per_client"])
-    except ClientError as error:  # of keyword arguments that its metadata give it
+    except ClientError as error:  # from wrong keyword arguments in its metadata
         raise ValueError(f"{folder / 'metadata.json'}: {error}") from None
     model = config.make(env, seed=0, device="cpu")
     model.import_parameters(folder / PARAMETERS)
@@ -79,7 +79,7 @@ def load_model(folder: Path, config: Config, family: Family) -> Federation:
 
 
 def read_deployed_policies(folder: Path, model: Federation) -> dict[str, np.ndarray]:
-    """Parameters of the policies that the clients deploy; nothing where the saved model's own are those.
+    """Parameters of the deployed policies; empty if they are the saved model's own.
 
     :raises ValueError: if the file is damaged or another model's
     """
@@ -98,7 +98,7 @@ def read_deployed_policies(folder: Path, model: Federation) -> dict[str, np.ndar
 
 @contextmanager
 def in_place(model: Federation, arrays: dict[str, np.ndarray]) -> Iterator[None]:
-    """The model with other parameters for a while."""
+    """Replace the model's parameters inside a ``with`` block."""
     before = model.acting_arrays()
     model.set_acting_arrays(arrays)
     try:

@@ -1,4 +1,4 @@
-"""What a run does when it is told to stop."""
+"""A run's reaction to signals that stop it."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopSignals:
-    """While it is entered, SIGINT, SIGTERM and SIGHUP end the training after the running round; a second one ends it at once.
+    """Inside its ``with`` block, SIGINT, SIGTERM and SIGHUP end the training after the current round; a second one at once.
 
-    At once means ``KeyboardInterrupt``, as does the first one while :attr:`can_wait` is false: before the first round there
-    is nothing to wait for. A signal that the process ignores stays ignored. SIGHUP says that the terminal is gone, and may
-    come from the shell and from the kernel: another one means the same, and what goes to the terminal is dropped.
+    At once means ``KeyboardInterrupt``. The first signal raises it too while :attr:`can_wait` is false: before the first round
+    there is nothing to wait for. A signal that the process ignores stays ignored. SIGHUP means that the terminal is gone. It
+    may come from the shell and from the kernel, so a second SIGHUP counts as the same; terminal output is then dropped.
     """
 
     def __init__(self) -> None:
-        #: the first signal that came
+        #: the first received signal
         self.received: int | None = None
-        #: whether rounds are running whose end somebody looks for :attr:`received`
+        #: whether rounds are running that check :attr:`received` at their end
         self.can_wait = False
         self._earlier: dict[int, Any] = {}
         self._terminals: list[int] = []
 
     @property
     def exit_code(self) -> int:
-        """As shells report it: 130 for SIGINT, 143 for SIGTERM, 129 for SIGHUP."""
+        """The exit code as in shells: 130 for SIGINT, 143 for SIGTERM, 129 for SIGHUP."""
         return 128 + (self.received or signal.SIGINT)
 
     def __enter__(self) -> StopSignals:
@@ -54,7 +54,7 @@ class StopSignals:
             raise KeyboardInterrupt
         with suppress(OSError):
             # A handler may interrupt a print, so it does not print itself.
-            os.write(2, b"\nstopping after this round; once more to stop at once\n")
+            os.write(2, b"\nstopping after this round; a second signal stops at once\n")
 
 
 def _is_terminal(descriptor: int) -> bool:
@@ -65,7 +65,7 @@ def _is_terminal(descriptor: int) -> bool:
 
 
 def _drop_output(descriptors: list[int]) -> None:
-    """Point them nowhere: to write to a terminal that is gone is an error, in the middle of whatever prints."""
+    """Redirect them to the null device: writing to a closed terminal raises an error in any print."""
     null = os.open(os.devnull, os.O_WRONLY)
     for descriptor in descriptors:
         os.dup2(null, descriptor)

@@ -1,4 +1,4 @@
-"""What a run is doing, in a file of its folder that others can read meanwhile."""
+"""The current stage of a run, in a file of its folder that other processes can read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sb3_fedguide.cli.run_folder import STATUS, write_json
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.offline.progress import Progress
 
-#: Seconds between two writings of the file.
+#: Seconds between two writes of the file.
 INTERVAL = 1.0
 
 
@@ -19,10 +19,10 @@ class Stage(NamedTuple):
     """A stage of a run.
 
     :param name: a piece of the offline stage, such as ``"prior"``, or ``"round"``
-    :param done: steps or rounds that are done
-    :param total: of them
-    :param seconds: since the stage began, or went on
-    :param left: seconds until its end, by its own pace; ``None`` where nothing is done yet
+    :param done: finished steps or rounds
+    :param total: all steps or rounds
+    :param seconds: since the stage began, or was resumed
+    :param left: estimated seconds until its end; ``None`` if nothing is done yet
     """
 
     name: str
@@ -37,10 +37,10 @@ class Stage(NamedTuple):
 
 
 class Status(RoundCallback):
-    """Writes the stage of a run into its folder; it is the offline stage's progress as well.
+    """Writes the stage of a run into its folder; also used as the offline stage's progress.
 
     :param n_rounds: of the whole run
-    :param bar: progress of the offline stage that is to be shown besides
+    :param bar: progress bar of the offline stage, to show too
     """
 
     def __init__(self, folder: Path, n_rounds: int, bar: Progress | None = None) -> None:
@@ -49,7 +49,7 @@ class Status(RoundCallback):
         self._name, self._first, self._began, self._written = "", 0, 0.0, 0.0
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Of a piece of the offline stage."""
+        """Report the progress of a piece of the offline stage."""
         if self.bar is not None:
             self.bar(stage, done, total)
         self._report(stage, done, total)
@@ -72,12 +72,12 @@ class Status(RoundCallback):
         self._written = now
 
     def remove(self) -> None:
-        """The run is over: its summary says the rest."""
+        """Remove the file at the end of the run: its summary has the results."""
         self.path.unlink(missing_ok=True)
 
 
 def read_status(folder: Path) -> Stage | None:
-    """What the run in ``folder`` said last; ``None`` where there is nothing that can be read."""
+    """The last stage of the run in ``folder``; ``None`` if there is no readable file."""
     try:
         content: dict[str, Any] = json.loads((folder / STATUS).read_text(encoding="utf-8"))
         left = content["left"]
@@ -88,7 +88,7 @@ def read_status(folder: Path) -> Stage | None:
 
 
 def duration(seconds: float) -> str:
-    """Such as ``40 s``, ``12 min`` or ``3 h 05 min``."""
+    """A duration such as ``40 s``, ``12 min`` or ``3 h 05 min``."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

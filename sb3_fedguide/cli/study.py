@@ -1,4 +1,4 @@
-"""A study: a benchmark whose methods, settings, families and seeds are in a file, with tables and figures at its end."""
+"""A study: a benchmark with methods, settings, families and seeds from a file, and tables and figures at its end."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sb3_fedguide.cli.benchmark_results import Results
     from sb3_fedguide.cli.benchmark_tables import Tables
 
-#: Inside the folder of all results: what studies end with.
+#: Inside the folder of all results: tables and figures of studies.
 STUDIES = "studies"
 #: Names of the files of tables, by form.
 FILES = {"markdown": "tables.md", "latex": "tables.tex", "json": "tables.json", "csv": "tables.csv"}
@@ -31,9 +31,9 @@ FILES = {"markdown": "tables.md", "latex": "tables.tex", "json": "tables.json", 
 def plan_study(arguments: argparse.Namespace, prog: str) -> Plan:
     """Check every run of the study in ``arguments.study``, or of the part that the flags choose; nothing is created.
 
-    What the file says of all runs and tables is put into ``arguments``.
+    The file's settings for all runs and tables are put into ``arguments``.
 
-    :raises ValueError: for anything that a user can put right
+    :raises ValueError: for anything that a user can correct
     """
     study = read_study(Path(arguments.study))
     try:
@@ -61,7 +61,7 @@ def _plan(study: Study, arguments: argparse.Namespace, prog: str) -> Plan:
     _check_places(rows, names)
     if not any(row.seeds and (row.families is None or set(row.families) & set(names)) for row in rows):
         given = [flag for flag in ("--algos", "--envs", "--seeds") if getattr(arguments, flag.removeprefix("--"))]
-        raise ValueError(f"no run of the study is left by {' with '.join(given)}; give less of that")
+        raise ValueError(f"{' with '.join(given)} leaves no run of the study; give fewer of these flags")
     study = replace(study, rows=rows)
     chosen = {name: families[name] for name in names}
     in_tables = [row.in_tables for row in rows]
@@ -87,7 +87,7 @@ def _plan(study: Study, arguments: argparse.Namespace, prog: str) -> Plan:
 
 
 def _chosen(study: Study, arguments: argparse.Namespace) -> list[Row]:
-    """The rows that ``--algos`` names, by their own name or their algorithm's; all without it."""
+    """The rows of ``--algos``, by their own name or their algorithm's; all without this flag."""
     asked = arguments.algos
     if asked is None:
         return list(study.rows)
@@ -96,7 +96,7 @@ def _chosen(study: Study, arguments: argparse.Namespace) -> list[Row]:
 
 
 def _part(row: Row, families: Mapping[str, Family], arguments: argparse.Namespace) -> Row:
-    """The row with the seeds that ``--seeds`` leaves."""
+    """The row with only the seeds of ``--seeds``."""
     check_names(row.families or (), families, f"family of method {row.name!r}:")
     if arguments.seeds is None:
         return row
@@ -117,7 +117,7 @@ def _check_places(rows: Sequence[Row], families: Sequence[str]) -> None:
 
 
 def _plan_row(row: Row, sources: Sequence[tuple[str, str]], arguments: argparse.Namespace, prog: str) -> Plan:
-    """What ``fedguide benchmark`` does for this row alone."""
+    """The plan of ``fedguide benchmark`` for this row alone."""
     from sb3_fedguide.cli.benchmark import Plan, make_plan
 
     if not sources or not row.seeds:
@@ -134,9 +134,9 @@ def _plan_row(row: Row, sources: Sequence[tuple[str, str]], arguments: argparse.
 
 
 def write_study(plan: Plan, arguments: argparse.Namespace, results: Results, tables: Tables) -> None:
-    """Its tables in every form, and the figures that its results allow, beside the results.
+    """Write its tables in every format, and the figures that its results allow, beside the results.
 
-    :raises OSError: where a file cannot be written
+    :raises OSError: if a file cannot be written
     """
     from sb3_fedguide.cli.benchmark_tables import WRITERS
     from sb3_fedguide.cli.run_folder import write_text
@@ -164,7 +164,7 @@ def write_study(plan: Plan, arguments: argparse.Namespace, results: Results, tab
 
 
 def _kept_runs(plan: Plan, results: Results) -> Comparison:
-    """The runs of the study whose folders are still there."""
+    """The runs of the study whose folders still exist."""
     from sb3_fedguide.cli.benchmark_runs import interrupted_folder, log_folder_of
     from sb3_fedguide.cli.plot_runs import read_run_folder
 

@@ -1,4 +1,4 @@
-"""The file of a study: which methods, in which settings, on which families, with which seeds. Imports nothing heavy."""
+"""The file of a study: methods, their settings, families and seeds. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ AtLeastOne = pydantic.Field(min_length=1)
 
 
 class MethodEntry(pydantic.BaseModel):
-    """A row of the study's tables: a method in one setting. What is not said is as for the whole study.
+    """A row of the study's tables: a method in one setting. Other entries are those of the whole study.
 
     :param algo: name of the algorithm; by default the row's own name
     :param conf: configuration: its name, or a YAML file beside the study's
     :param label: of its results; by default the configuration's name
     :param params: hyperparameters, over those of the whole study
-    :param families: those that have this row
+    :param families: families with this row
     :param delays: as ``--delays`` of the training command
     """
 
@@ -48,16 +48,16 @@ class MethodEntry(pydantic.BaseModel):
 class StudyFile(pydantic.BaseModel):
     """The file.
 
-    :param title: what it is about
+    :param title: of the study
     :param methods: name of a row to its :class:`MethodEntry`, or nothing
     :param families: of client environments, by name
-    :param metadata: files of families of one's own, beside the study's file
+    :param metadata: files of the user's own families, relative to the study's file
     :param rounds: of every run; by default those of the configuration
     :param eval_average: also evaluate the average of the clients' policies (Theorem 3), and keep the runs' folders
-    :param baseline: row that scores 1, and that differences and the speed-up refer to
-    :param at_rounds: rounds of the curve that tables show
-    :param overview: columns that get a table of their own: a row per family, a column per method
-    :param folder: of the results, beside the study's file
+    :param baseline: row with score 1, the reference of differences and the speed-up
+    :param at_rounds: rounds of the learning curve that tables show
+    :param overview: columns that get their own table: a row per family, a column per method
+    :param folder: of the results, relative to the study's file
     :param processes: runs at a time
     """
 
@@ -104,7 +104,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Study:
-    """A study, checked as far as that goes without its families.
+    """A study, checked as far as possible without its families.
 
     :param name: of its file
     :param metadata: paths from here
@@ -127,7 +127,7 @@ class Study:
 
 
 def read_study(path: Path) -> Study:
-    """:raises ValueError: one line, for a file that cannot be read or says something unknown or wrong"""
+    """:raises ValueError: one line, for a file that cannot be read or has an unknown or wrong entry"""
     if not path.is_file():
         raise ValueError(f"--study: there is no file {path}")
     try:
@@ -140,7 +140,7 @@ def read_study(path: Path) -> Study:
 def _study(path: Path, content: Any) -> Study:
     from sb3_fedguide.cli.benchmark_tables import columns_of
 
-    example = "a study says at least its methods and families, e.g. {methods: {local: {}}, families: [HopperHard]}"
+    example = "a study has at least methods and families, e.g. {methods: {local: {}}, families: [HopperHard]}"
     if not isinstance(content, Mapping):
         raise ValueError(example)
     file = check_model("the study", StudyFile, content, {})
@@ -175,9 +175,9 @@ def _row(path: Path, file: StudyFile, name: str, entry: Mapping[str, Any]) -> Ro
     if not name.strip():
         raise ValueError(f"a method has the name {name!r}; give its row of the tables one, such as local")
     if "|" in name or "\n" in name:
-        raise ValueError(f"method {name!r} is to be a row of a table; give it a name without | and line breaks")
+        raise ValueError(f"method {name!r} becomes a row of a table; give it a name without | and line breaks")
     if own.algo is None and (first := name.split()[0]) in ALGORITHMS and first != name:
-        raise ValueError(f"method {name!r} does not say its algorithm; give it algo: {first}")
+        raise ValueError(f"method {name!r} has no algorithm; give it algo: {first}")
     algo = own.algo or name
     check_names([algo], ALGORITHMS, f"algorithm of method {name!r}:" if own.algo else "algorithm")
     conf = own.conf or file.conf
@@ -210,7 +210,7 @@ def _dotted(params: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 def _flag_value(method: str, key: str, value: Any) -> str:
     """A hyperparameter for ``-params``, as YAML that is read as the same value again.
 
-    :raises ValueError: for a date and whatever else YAML has and no hyperparameter can be
+    :raises ValueError: for a date and other YAML values that a hyperparameter cannot have
     """
     try:
         return f"{key}:{json.dumps(value, ensure_ascii=False)}"

@@ -1,4 +1,4 @@
-"""``--track``: a run's log in Weights & Biases or trackio as well, with TensorBoard's keys and environment steps as x axis."""
+"""``--track``: also log a run to Weights & Biases or trackio, with TensorBoard's keys and environment steps as x axis."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from stable_baselines3.common.logger import KVWriter
 
 
 class TrackerOutputFormat(KVWriter):
-    """An output of SB3's logger that hands every number to a tracking library.
+    """An output of SB3's logger that sends every number to a tracking library.
 
     :param name: of the library: ``trackio`` or ``wandb``
-    :param project: where the library puts the run
-    :param folder: of the run. A run that goes on in its folder goes on in the library too
-    :param config: what the library shows as settings
-    :param resumed: whether the run goes on
+    :param project: of the run in the library
+    :param folder: of the run; a run that is resumed in its folder is resumed in the library too
+    :param config: settings that the library shows
+    :param resumed: whether the run is resumed
     """
 
     def __init__(self, name: str, project: str, folder: Path, config: Mapping[str, Any], resumed: bool) -> None:
@@ -35,7 +35,7 @@ class TrackerOutputFormat(KVWriter):
             shown.update(name=run_name, resume="allow" if resumed else "never")
         try:
             self._run = self._tracker.init(**shown)
-        except Exception as error:  # whatever the library raises without a key, a network or a writable folder
+        except Exception as error:  # any error of the library without a key, a network or a writable folder
             reason = " ".join(str(error).split()) or type(error).__name__
             raise OSError(f"--track {name}: {reason}") from error
 
@@ -48,7 +48,7 @@ class TrackerOutputFormat(KVWriter):
         self._run.log(numbers, step=step)
 
     def finish(self, summary: Mapping[str, Any]) -> None:
-        """Hand over what a run ends with, as ``summary/`` keys, and end it in the library."""
+        """Send the run's summary, as ``summary/`` keys, and end the run in the library."""
         numbers = {
             f"summary/{name}": value
             for name, value in _flat(summary).items()
@@ -61,7 +61,7 @@ class TrackerOutputFormat(KVWriter):
         self._run.finish()
 
     def close(self) -> None:
-        """The logger is closed before the summary is known. What never gets that far is ended when Python ends."""
+        """Do nothing: the logger is closed before the summary is known. A run without a summary ends with Python."""
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

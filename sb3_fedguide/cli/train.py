@@ -43,7 +43,7 @@ PACKAGE = Path(__file__).parents[1]
 def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
     """Run the command.
 
-    :return: the exit code: 0, 1 where a file could not be written or a client broke, 2 for wrong input, 130 after an
+    :return: the exit code: 0, 1 if a file could not be written or a client failed, 2 for wrong input, 130 after an
         interrupt (SIGINT), 143 after SIGTERM, 129 after SIGHUP
     """
     arguments = parse_train(argv, prog)
@@ -67,7 +67,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
         with _no_reports_of_threads(), _short_warnings(prog):
             return run()
     except ClientError as error:
-        print(f"{prog}: error: {one_message(error)}; what was written before stays", file=sys.stderr)
+        print(f"{prog}: error: {one_message(error)}; earlier files stay", file=sys.stderr)
         return EXIT_FAILED
     except EngineError as error:
         print(f"{prog}: error: {error}", file=sys.stderr)
@@ -76,13 +76,13 @@ def main(argv: Sequence[str] | None = None, prog: str = "train.py") -> int:
         raise
     except OSError as error:  # a full disk, or a folder that is read-only
         where = error.filename or arguments.log_folder
-        print(f"{prog}: error: {where}: {error.strerror or error}; what was written before stays", file=sys.stderr)
+        print(f"{prog}: error: {where}: {error.strerror or error}; earlier files stay", file=sys.stderr)
         return EXIT_FAILED
 
 
 @contextmanager
 def _no_reports_of_threads() -> Iterator[None]:
-    """TensorBoard writes in a thread of its own. What fails there is raised here by its next call; once is enough."""
+    """Suppress reports of TensorBoard's own writer thread. Its next call here raises the error again; once is enough."""
     before = threading.excepthook
     threading.excepthook = lambda failure: None if isinstance(failure.exc_value, OSError) else before(failure)
     try:
@@ -93,7 +93,7 @@ def _no_reports_of_threads() -> Iterator[None]:
 
 @contextmanager
 def _short_warnings(prog: str) -> Iterator[None]:
-    """Warnings of this package are for the user: without the line of code that Python shows with them."""
+    """Show warnings of this package without the line of code that Python adds."""
     before = warnings.formatwarning
 
     def format_warning(
@@ -111,10 +111,10 @@ def _short_warnings(prog: str) -> Iterator[None]:
 
 
 def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Callable[[], int]:
-    """What goes on with the run in ``folder``, and holds it until then.
+    """A function that resumes the run in ``folder``; the folder is locked until then.
 
     :param given: the flags on the command line
-    :raises ValueError: where it cannot go on
+    :raises ValueError: if the run cannot be resumed
     """
     from sb3_fedguide.cli.delays import read_delays
     from sb3_fedguide.cli.run_folder import exclusive
@@ -131,7 +131,7 @@ def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Call
         if (rounds := finished_rounds(folder)) is not None:
             check_length(folder, config, rounds)
             if config.n_rounds == rounds:
-                print(f"the run in {folder} is finished: it had its {rounds} rounds")
+                print(f"the run in {folder} is finished: it has done its {rounds} rounds")
                 return lambda: 0
         run = Run(request, command, make_model(request), folder, longer=config != before)
         if load_checkpoint(folder, run.model.resume, prog):
@@ -143,7 +143,7 @@ def resume(folder: Path, given: dict[str, Any], command: str, prog: str) -> Call
 def prepare(request: Request, command: str) -> Run:
     """Construct the algorithm; nothing is written yet.
 
-    :raises ValueError: where the settings do not fit the environments or the data
+    :raises ValueError: if the settings do not fit the environments or the data
     """
     dataset = request.config.values["pretraining"]["dataset"]
     if dataset is not None:
@@ -156,7 +156,7 @@ def prepare(request: Request, command: str) -> Run:
 def make_model(request: Request) -> FederatedPPO | FederatedDDPG:
     """Construct the algorithm.
 
-    :raises ValueError: where the settings do not fit together
+    :raises ValueError: if the settings do not fit together
     """
     import torch as th
 

@@ -1,4 +1,4 @@
-"""The tuning command: trials with equal environment steps, in a study that can be interrupted and gone on with."""
+"""The tuning command: trials with equal environment steps, in a resumable study."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ if TYPE_CHECKING:
     from sb3_fedguide.cli.tune_trials import ActiveTrial
     from sb3_fedguide.settings.config import Config
 
-#: Trials that fail before the first one works, after which no more are begun.
+#: Number of failed trials before the first success after which no more are begun.
 MAX_FAILURES = 3
-#: Shares of a trial's rounds: what the median pruner leaves alone, and the halving pruner's first rung.
+#: Shares of a trial's rounds: the median pruner's warm-up, and the halving pruner's first rung.
 MEDIAN_WARM_UP, FIRST_RUNG = 3, 8
 POLL = 0.1
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """What is to be done.
+    """The work of a tuning.
 
     :param flags: of the training command, for every run
     :param config: hyperparameters without those of a trial
-    :param n_trials: how many the study is to have
+    :param n_trials: number of trials of the study
     :param folder: of the study: a folder for every trial, and the best settings
     """
 
@@ -64,7 +64,7 @@ class Tuning:
     storage: Path
 
     def train_flags(self, settings: Mapping[str, Any]) -> list[str]:
-        """Of the training command with the settings of a trial."""
+        """Flags of the training command with the settings of a trial."""
         return [*self.flags, "-params", *(f"{name}:{json.dumps(value)}" for name, value in settings.items())]
 
     def resolve(self, settings: Mapping[str, Any]) -> Config:
@@ -77,7 +77,7 @@ class Tuning:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What has to be the same where a study is gone on with."""
+        """Settings that must be the same to resume a study."""
         arguments = self.arguments
         return {
             "algo": arguments.algo, "clients": self.family.content_hash, "space": json.dumps(self.space.plain()),
@@ -90,7 +90,7 @@ class Tuning:
 def main(argv: Sequence[str] | None = None, prog: str = "fedguide tune") -> int:
     """Run the command.
 
-    :return: the exit code: 0, 1 where a trial failed or a file could not be written, 2 for wrong input, 130 after an interrupt
+    :return: the exit code: 0, 1 if a trial failed or a file could not be written, 2 for wrong input, 130 after an interrupt
         (SIGINT), 143 after SIGTERM
     """
     arguments = parse_tune(argv, prog)
@@ -120,9 +120,9 @@ def main(argv: Sequence[str] | None = None, prog: str = "fedguide tune") -> int:
 
 
 def plan(arguments: argparse.Namespace, prog: str) -> Tuning:
-    """Check everything, every value of the search space too; nothing is created.
+    """Check everything, also every value of the search space; nothing is created.
 
-    :raises ValueError: for anything that a user can put right
+    :raises ValueError: for anything that a user can correct
     """
     from sb3_fedguide.cli.run_folder import check_log_folder
     from sb3_fedguide.cli.tune_space import default_space, read_space
@@ -156,7 +156,7 @@ def plan(arguments: argparse.Namespace, prog: str) -> Tuning:
 def open_study(tuning: Tuning) -> optuna.Study:
     """The study in its SQLite file, made if there is none.
 
-    :raises ValueError: for a file that is none of Optuna's, or a study with other settings
+    :raises ValueError: for a file that is not Optuna's, or a study with other settings
     """
     import optuna
     from sqlalchemy.exc import SQLAlchemyError
@@ -203,11 +203,11 @@ def _pruner(tuning: Tuning) -> optuna.pruners.BasePruner:
 
 
 def _run(tuning: Tuning, study: optuna.Study) -> int:
-    """Do the trials that are missing and report each."""
+    """Do the missing trials and report each."""
     from sb3_fedguide.cli.signals import StopSignals
 
     n_done = len(_begun(study))
-    _say(f"study {tuning.name}: {n_done} of {tuning.n_trials} trials there; {tuning.config.n_rounds} rounds and "
+    _say(f"study {tuning.name}: {n_done} of {tuning.n_trials} trials done; {tuning.config.n_rounds} rounds and "
          f"{len(tuning.arguments.seeds)} seeds each, storage {tuning.storage}")  # fmt: skip
     active: list[ActiveTrial] = []
     outcomes: Counter[str] = Counter()
@@ -221,12 +221,12 @@ def _run(tuning: Tuning, study: optuna.Study) -> int:
                     outcomes[_tell(study, trial)] += 1
                 time.sleep(POLL)
         except KeyboardInterrupt:
-            pass  # the second signal: the runs are ended, and the first one is in signals.received
+            pass  # the second signal: all runs have been killed, and signals.received has the first one
         finally:
             for trial in active:
                 trial.release()
     if signals.received is not None:
-        _say("interrupted; the same command goes on with the study")
+        _say("interrupted; the same command resumes the study")
         return signals.exit_code
     if outcomes["failed"]:
         _say(f"{outcomes['failed']} trials failed")
@@ -236,14 +236,14 @@ def _run(tuning: Tuning, study: optuna.Study) -> int:
 def _fill(
     tuning: Tuning, study: optuna.Study, active: list[ActiveTrial], outcomes: Counter[str], signals: StopSignals
 ) -> bool:
-    """Begin trials as long as there are some to be done and one may run; whether there was one."""
+    """Begin missing trials while one may run; return whether there was one."""
     before = len(active)
     if signals.received is not None:
         for trial in active:
             trial.stop()
         return False
     if outcomes["failed"] >= MAX_FAILURES and not outcomes["complete"] + outcomes["pruned"]:
-        return False  # nothing works, and more of it would use up the study
+        return False  # all trials fail, and more of them would use up the study
     while len(active) < tuning.arguments.processes and signals.received is None:
         found = next_trial(tuning, study)
         if found is None:
@@ -253,7 +253,7 @@ def _fill(
 
 
 def next_trial(tuning: Tuning, study: optuna.Study) -> ActiveTrial | None:
-    """A trial that was begun and that nobody does now, or a new one; ``None`` where the study has what it is to have."""
+    """A begun trial that no process does now, or a new one; ``None`` if the study is complete."""
     import optuna
     from optuna.trial import TrialState
 
@@ -266,7 +266,7 @@ def next_trial(tuning: Tuning, study: optuna.Study) -> ActiveTrial | None:
             try:
                 trial.claim(_trial_folder(tuning, begun.number))
             except ValueError:
-                continue  # another process is at it
+                continue  # another process does it
             return trial
         while len(_begun(study)) < tuning.n_trials:
             asked = _ask(tuning, study)
@@ -279,7 +279,7 @@ def next_trial(tuning: Tuning, study: optuna.Study) -> ActiveTrial | None:
 
 
 def _ask(tuning: Tuning, study: optuna.Study) -> optuna.Trial:
-    """A new trial. Its number is the sampler's seed: an interruption does not make it propose the same again."""
+    """A new trial. Its number is the sampler's seed, so that a resumed sampler does not propose the same again."""
     import optuna
     from optuna.trial import TrialState
 
@@ -297,7 +297,7 @@ def _ask(tuning: Tuning, study: optuna.Study) -> optuna.Trial:
 
 
 def _known(study: optuna.Study, asked: optuna.Trial) -> bool:
-    """Whether an earlier trial had the same settings, whose result is the same too; it is told without another run."""
+    """Whether an earlier trial had the same settings; the trial then gets the same result without another run."""
     from optuna.trial import TrialState
 
     for earlier in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED)):
@@ -345,7 +345,7 @@ def _active(tuning: Tuning, trial: optuna.Trial, settings: Mapping[str, Any], re
 
 
 def _tell(study: optuna.Study, trial: ActiveTrial) -> str:
-    """Optuna and the user; what was interrupted stays as it is."""
+    """Report a trial to Optuna and the user; an interrupted trial stays unfinished."""
     from optuna.trial import TrialState
 
     shown = ", ".join(f"{name} {value}" for name, value in trial.settings.items())

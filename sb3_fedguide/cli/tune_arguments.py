@@ -10,7 +10,7 @@ from sb3_fedguide.cli.arguments import OneLineParser, train_parser
 from sb3_fedguide.cli.benchmark_arguments import check_seeds_and_processes
 from sb3_fedguide.registry import ALGORITHMS
 
-#: Flags of the training command that say what a run computes.
+#: Flags of the training command that determine a run's results.
 SETTINGS = (
     "algo", "env", "client_kwargs", "env_kwargs", "metadata", "dataset", "rounds", "n_timesteps", "n_envs_per_client",
     "conf_file", "hyperparams", "eval_freq", "eval_episodes",
@@ -28,7 +28,7 @@ def tune_parser(prog: str) -> OneLineParser:
         prog=prog,
         allow_abbrev=False,
         description="Search for an algorithm's hyperparameters with Optuna. Every trial has the same environment steps; the "
-        "same command goes on until there are so many trials.",
+        "same command resumes the study until it has N trials.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     flag = parser.add_argument
@@ -38,12 +38,12 @@ def tune_parser(prog: str) -> OneLineParser:
     parser.set_defaults(algo=None)
     flag("--n-trials", type=int, metavar="N", help="trials of the study, earlier ones included; by default "
          f"{N_TRIALS}, and with --sampler grid every combination")  # fmt: skip
-    flag("--seeds", nargs="+", type=int, default=[0], metavar="N", help="of a trial's runs, one after another; its value is "
-         "their mean")  # fmt: skip
-    flag("--search", metavar="SPACE.yml", help="what is searched, NAME: [values] or NAME: {low, high, log}; by default a "
+    flag("--seeds", nargs="+", type=int, default=[0], metavar="N", help="random seeds of a trial's runs, one after another; "
+         "its value is their mean")  # fmt: skip
+    flag("--search", metavar="SPACE.yml", help="search space, NAME: [values] or NAME: {low, high, log}; by default a "
          "small space of the algorithm (docs/tuning.md)")  # fmt: skip
-    flag("--sampler", default="tpe", choices=SAMPLERS, help="how settings are proposed; grid: every combination once")
-    flag("--pruner", default="median", choices=PRUNERS, help="which trials are ended early")
+    flag("--sampler", default="tpe", choices=SAMPLERS, help="method that proposes settings; grid: every combination once")
+    flag("--pruner", default="median", choices=PRUNERS, help="method that ends trials early")
     flag("--storage", metavar="FILE.db", help="SQLite file of the study; by default DIR/STUDY/study.db")
     flag("--study-name", metavar="STUDY", help="by default FAMILY-ALGO")
     flag("--processes", type=int, default=1, metavar="K", help="trials at a time")
@@ -52,7 +52,7 @@ def tune_parser(prog: str) -> OneLineParser:
 
 
 def parse_tune(argv: Sequence[str] | None, prog: str) -> argparse.Namespace:
-    """Parse, and refuse what the flags alone show to be wrong."""
+    """Parse, and refuse errors that the flags alone show."""
     parser = tune_parser(prog)
     arguments = parser.parse_strictly(argv)
     try:
@@ -69,9 +69,7 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--n-trials must be at least 1, not {arguments.n_trials}")
     check_seeds_and_processes(arguments.seeds, arguments.processes)
     if arguments.study_name is not None and not _is_file_name(arguments.study_name):
-        raise ValueError(
-            f"--study-name {arguments.study_name!r} is to be the name of a folder too; leave out / and leading dots"
-        )
+        raise ValueError(f"--study-name {arguments.study_name!r} is also the name of a folder; leave out / and leading dots")
     if arguments.storage is not None and Path(arguments.storage).is_dir():
         raise ValueError(f"--storage {arguments.storage} is a folder; give the path of an SQLite file")
 

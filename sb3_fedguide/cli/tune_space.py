@@ -1,4 +1,4 @@
-"""What ``fedguide tune`` searches: a mapping of hyperparameters to their values, from a YAML file or by default."""
+"""The search space of ``fedguide tune``: hyperparameters and their values, from a YAML file or by default."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sb3_fedguide.registry import algorithm, registered_names
 if TYPE_CHECKING:
     import optuna
 
-#: What every PPO method searches besides its own coefficients.
+#: Hyperparameters that every PPO method searches besides its own coefficients.
 PPO: dict[str, list[Any]] = {"learning_rate": [1e-4, 3e-4, 1e-3], "n_epochs": [4, 8, 16]}
 DDPG: dict[str, list[Any]] = {"learning_rate": [3e-5, 1e-4, 3e-4], "tau": [0.001, 0.005]}
 #: At most three values of an algorithm's own coefficients, so that all are tuned with about equal effort.
@@ -29,13 +29,13 @@ OWN: dict[str, dict[str, list[Any]]] = {
     "fedguide-a": {"lambda_trust": [0.01, 0.05, 0.2], "lambda_prior": [0.02, 0.1, 0.5], "average_every": [1, 5, 10]},
     "fedguide-r": {"server_step": [1.0, 2.0, 3.0], "mix": ["until_0.3", "until_0.4", "until_0.5"]},
 }
-#: What decides how many environment steps a trial has.
+#: Hyperparameters that determine the environment steps of a trial.
 BUDGET = ("n_rounds", "rollout_size", "client_fraction")
 
 
 @dataclass(frozen=True)
 class Interval:
-    """Numbers from ``low`` to ``high``, whole ones where both are; proposed on a logarithmic scale if ``log``."""
+    """Numbers from ``low`` to ``high``, integers if both are; proposed on a logarithmic scale if ``log``."""
 
     low: float
     high: float
@@ -48,12 +48,12 @@ class Interval:
 
 @dataclass(frozen=True)
 class Space:
-    """Name (dotted where nested) to a list of values or an interval."""
+    """Name (dotted if nested) to a list of values or an interval."""
 
     entries: Mapping[str, list[Any] | Interval]
 
     def suggest(self, trial: optuna.Trial) -> dict[str, Any]:
-        """One setting, as the study's sampler proposes it."""
+        """One proposal of the study's sampler."""
         return {name: self._suggest(trial, name) for name in self.entries}
 
     def _suggest(self, trial: optuna.Trial, name: str) -> Any:
@@ -67,7 +67,7 @@ class Space:
     def grid(self) -> Iterator[dict[str, str]]:
         """Every combination, as Optuna's parameters.
 
-        :raises ValueError: where there is an interval
+        :raises ValueError: if there is an interval
         """
         for name, entry in self.entries.items():
             if isinstance(entry, Interval):
@@ -76,7 +76,7 @@ class Space:
         return (dict(zip(self.entries, values, strict=True)) for values in itertools.product(*texts))
 
     def probes(self) -> Iterator[dict[str, Any]]:
-        """Every value, or both ends of an interval, beside the first ones of the other parameters."""
+        """Every value, or both ends of an interval, with the first values of the other parameters."""
         ends = {
             name: [entry.low, entry.high] if isinstance(entry, Interval) else entry for name, entry in self.entries.items()
         }
@@ -87,14 +87,14 @@ class Space:
                 yield {**first, name: value}
 
     def plain(self) -> dict[str, Any]:
-        """As it would stand in a file."""
+        """The space as plain data, as in a file."""
         return {name: vars(entry) if isinstance(entry, Interval) else entry for name, entry in self.entries.items()}
 
 
 def default_space(algo: str, fixed: Mapping[str, Any]) -> Space:
-    """The space of an algorithm, or of the nearest known class of one of the user's own, without what is ``fixed``.
+    """The space of an algorithm (of a user's own: that of its nearest known class), without ``fixed`` hyperparameters.
 
-    :raises ValueError: where nothing is left
+    :raises ValueError: if nothing is left
     """
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
@@ -103,14 +103,14 @@ def default_space(algo: str, fixed: Mapping[str, Any]) -> Space:
     entries = {**own, **(PPO if issubclass(cls, FederatedPPO) else DDPG)}
     left = {name: values for name, values in entries.items() if name not in fixed}
     if not left:
-        raise ValueError(f"-params fixes all that is searched for {algo}: {', '.join(entries)}; give a space with --search")
+        raise ValueError(f"-params fixes the whole search space of {algo}: {', '.join(entries)}; give a space with --search")
     return Space(left)
 
 
 def read_space(path: Path, fixed: Mapping[str, Any]) -> Space:
     """The space in a YAML file.
 
-    :raises ValueError: for a file that cannot be read or is no space, or what is ``fixed`` as well
+    :raises ValueError: for a file that cannot be read or is not a space, or if it has ``fixed`` hyperparameters
     """
     from sb3_fedguide.settings.config import read_yaml
 

@@ -1,4 +1,4 @@
-"""What ``fedguide tune`` ends with: the best trials, and the best settings as a configuration."""
+"""The result of ``fedguide tune``: the best trials, and the best settings as a configuration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHOWN_TRIALS = 10
 
 
 def conclude(tuning: Tuning, study: optuna.Study) -> None:
-    """The table of the best trials, and their best settings as a configuration."""
+    """Print the table of the best trials, and write the best settings as a configuration."""
     from optuna.trial import TrialState
 
     trials = study.get_trials(deepcopy=False)
@@ -51,5 +51,5 @@ def conclude(tuning: Tuning, study: optuna.Study) -> None:
 
 
 def _plain(parameter: Any) -> Any:
-    """A value as Optuna has it, as plain data: entries of lists are JSON there."""
+    """An Optuna value as plain data: entries of lists are JSON in Optuna."""
     return json.loads(parameter) if isinstance(parameter, str) else parameter

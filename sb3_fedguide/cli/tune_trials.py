@@ -1,4 +1,4 @@
-"""One trial of ``fedguide tune``: a training command for each seed, whose evaluations the pruner sees while it runs."""
+"""One trial of ``fedguide tune``: a training command for each seed; the pruner sees its evaluations during the run."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 class ActiveTrial:
-    """A trial that this process does, and its right to do so until :meth:`release`.
+    """A trial of this process, with the exclusive right to do it until :meth:`release`.
 
-    A step of Optuna's is a round of the trial, its seeds one after another: with two seeds of 60 rounds there are 120. The
+    A step in Optuna is a round of the trial, with its seeds one after another: two seeds of 60 rounds are 120 steps. The
     value of a step is the client-average return of the deployed policies in that round, the mean of the seeds that had it.
 
-    :param reported: steps that Optuna knows already, of an earlier part of the trial
+    :param reported: steps that Optuna already has, from an earlier part of the trial
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class ActiveTrial:
     ) -> None:
         self.trial, self.settings, self.runs = trial, settings, runs
         self.n_rounds, self.n_clients = n_rounds, n_clients
-        #: what became of it: a value, or why there is none; neither as long as it is not known
+        #: the outcome: a value, or the reason why there is none; neither until it is known
         self.value: float | None = None
         self.problem, self.pruned = "", False
         self.rounds_done = 0
@@ -53,19 +53,19 @@ class ActiveTrial:
         self._lock.enter_context(exclusive(folder))
 
     def stop(self) -> None:
-        """Let the run end after its round, with a checkpoint, and begin none."""
+        """Let the run end after its round, with a checkpoint, and begin no other."""
         self._stopped = True
         if self._process is not None:
             self._process.stop()
 
     def release(self) -> None:
-        """End what runs, at once, and let others do the trial."""
+        """Kill the current run, and let other processes do the trial."""
         if self._process is not None:
             self._process.kill()
         self._lock.close()
 
     def is_over(self) -> bool:
-        """Look what there is to be done: start the next run, tell Optuna of evaluations, take a result."""
+        """Do the next actions: start the next run, report evaluations to Optuna, take a result."""
         try:
             return self._advance()
         except (ValueError, OSError) as error:
@@ -117,14 +117,14 @@ class ActiveTrial:
                 seeds = [curve[round] for curve in self._curves[: index + 1] if round in curve]
                 self.trial.report(sum(seeds) / len(seeds), step)
                 self._reported.add(step)
-            # In order of the rounds, however many there are at once: what is pruned does not depend on the machine.
+            # In order of the rounds, for any number of new ones: pruning does not depend on the machine.
             if step < len(self.runs) * self.n_rounds and self.trial.should_prune():
                 self.pruned = True
                 return
 
 
 def evaluated(run: BenchmarkRun, n_clients: int) -> dict[int, float]:
-    """Round to client-average return of the deployed policies, as far as a run has written it."""
+    """Round to client-average return of the deployed policies, as far as a run has written them."""
     folder = interrupted_folder(run.log_folder, run.method)
     if folder is None or not (folder / EVALUATIONS).is_file():
         return {}

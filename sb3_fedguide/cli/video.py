@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
 
 FORMATS = ("gif", "mp4")
-#: Width and height of a frame are at least so many pixels.
+#: Smallest width and height of a frame in pixels.
 SMALLEST = 480
-#: Frames per second, at most. An environment that is faster leaves frames out, and keeps its speed.
+#: Upper bound on frames per second. The video of a faster environment leaves frames out, and keeps its speed.
 FASTEST = 34
-#: Frames of a GIF: more would make it unwieldy.
+#: Upper bound on frames of a GIF: more would make the file too large.
 MAX_FRAMES = 200
 _COLORS = 64
 
 
 def check_format(suffix: str) -> None:
-    """:raises ValueError: where what writes it is not installed"""
+    """:raises ValueError: if its encoder is not installed"""
     if suffix == "mp4" and importlib.util.find_spec("moviepy") is None:
         raise ValueError("--video-format mp4 needs moviepy: pip install 'sb3-fedguide[video]', or take gif")
 
@@ -40,9 +40,9 @@ def check_format(suffix: str) -> None:
 def write_videos(
     folder: Path, policy: str, algo: str, family: Family, model: Federation, seed: int, suffix: str = "gif"
 ) -> list[Path]:
-    """One deterministic episode of each client with the model's current policies; client and return stand in the picture.
+    """One deterministic episode of each client with the model's current policies; the picture shows client and return.
 
-    :param policy: which of the run's policies these are; part of the files' names
+    :param policy: name of the policies; part of the files' names
     :param seed: of the episodes' starts
     :return: the files
     """
@@ -60,10 +60,10 @@ def write_videos(
 
 
 def frame_steps(length: int, rate: float, most: int | None) -> list[int]:
-    """Steps after which there is a frame: evenly spaced, with the start and the last.
+    """Steps after which there is a frame: evenly spaced, with the first and the last.
 
     :param rate: steps per second
-    :param most: of them; ``None`` for no limit
+    :param most: upper bound on frames; ``None`` for none
     """
     n_frames = length // math.ceil(rate / FASTEST) + 1
     return evenly(length, max(2, n_frames if most is None else min(n_frames, most)))
@@ -77,7 +77,7 @@ def _captioned(family: Family, episode: Episode, steps: Sequence[int], heading: 
 
 
 def caption(frame: np.ndarray, heading: str, line: str) -> Image:
-    """The frame, enlarged where it is small, with two lines of text above it."""
+    """The frame, enlarged if it is small, with two lines of text above it."""
     from PIL import Image, ImageDraw, ImageFont
 
     picture = Image.fromarray(frame)

@@ -1,4 +1,4 @@
-"""Earlier policies that a method holds on to: kept as arrays, brought back as tensors or as actors."""
+"""Earlier policies that a method keeps: stored as arrays, restored as tensors or as actors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def actor_at(policy: StackedMlpPolicy, parameters: Mapping[str, np.ndarray]) -> 
     """An actor of this policy's architecture with other parameters, on this policy's device.
 
     :param parameters: at least every actor parameter, as :func:`snapshot` names them
-    :return: the actor, and its trainable tensors under the policy's names, ``log_std`` among them where there is one
+    :return: the actor, and its trainable tensors under the policy's names, with ``log_std`` if there is one
     """
     actor = policy.actor()
     tensors: dict[str, th.Tensor] = {}

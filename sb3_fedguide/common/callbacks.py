@@ -1,4 +1,4 @@
-"""Callbacks that know of communication rounds."""
+"""Callbacks with events for communication rounds."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 class RoundCallback(BaseCallback):
     """A callback with four more events: before a round, after local training, after the exchange, after the round's log.
 
-    Between the two, a method that shares its policy replaces the clients' own parameters: what a client would deploy is
-    seen in :meth:`_on_local_training_end`, what the server broadcast in :meth:`_on_round_end`.
+    A method that shares its policy replaces the clients' own parameters in the exchange: :meth:`_on_local_training_end` sees
+    the policies that the clients deploy, :meth:`_on_round_end` those that the server broadcast.
     """
 
     model: Federation  # type: ignore[assignment]
@@ -32,11 +32,11 @@ class RoundCallback(BaseCallback):
     state_attributes: ClassVar[tuple[str, ...]] = ()
 
     def save_state(self) -> State:
-        """What a checkpoint has to know of this callback, as plain data."""
+        """This callback's part of a checkpoint, as plain data."""
         return save_held(self)
 
     def load_state(self, state: State) -> None:
-        """Go on from what :meth:`save_state` returned, before the training starts."""
+        """Restore the state from :meth:`save_state`, before the training starts."""
         load_held(self, state)
 
     def _on_step(self) -> bool:
@@ -55,7 +55,7 @@ class RoundCallback(BaseCallback):
         return self._on_round_logged()
 
     def _on_round_start(self) -> None:
-        """Before the rollout; who takes part is known."""
+        """Before the rollout; the participants are known."""
 
     def _on_local_training_end(self) -> None:
         """After ``train()``, before the exchange."""
@@ -64,7 +64,7 @@ class RoundCallback(BaseCallback):
         """After the exchange, before the round's log is written."""
 
     def _on_round_logged(self) -> bool:
-        """After everything that belongs to the round; false ends the training."""
+        """After the whole round; false ends the training."""
         return True
 
 
@@ -145,7 +145,7 @@ class ExchangeCallback(RoundCallback):
             self._exchange(uploading)
 
     def _exchange(self, uploading: np.ndarray) -> None:
-        """Carry what the clients ``uploading``, ``(n_clients,)`` bool, send, and what they are sent."""
+        """Exchange payloads with the clients ``uploading``, ``(n_clients,)`` bool."""
         model = self.model
         started = time.perf_counter()
         present = {client: index for index, client in enumerate(model.client_ids) if uploading[index]}
@@ -162,14 +162,14 @@ class ExchangeCallback(RoundCallback):
         self.logger.record("time/exchange", time.perf_counter() - started)
 
     def _remember_outdated(self) -> None:
-        """The model's checkpoints and archives hold it."""
+        """Store it in the model, so that checkpoints and archives hold it."""
         self.model.outdated[:] = [client in self.server.outdated for client in self.model.client_ids]
 
 
 class RoundProgressCallback(RoundCallback):
     """A progress bar over all rounds of a run with the client-average return of finished training episodes.
 
-    Their actions are sampled: evaluations, which are deterministic, return something else.
+    Their actions are sampled; evaluations are deterministic and have other returns.
     """
 
     def __init__(self) -> None:

@@ -23,16 +23,16 @@ __all__ = [
 
 
 class CheckpointError(ValueError):
-    """A run cannot be saved, or cannot go on from its checkpoint."""
+    """A run cannot be saved, or cannot be resumed from its checkpoint."""
 
 
 class CheckpointCallback(RoundCallback):
-    """Writes a checkpoint every ``save_freq`` rounds, from which :meth:`Federation.resume` goes on.
+    """Writes a checkpoint every ``save_freq`` rounds, for :meth:`Federation.resume`.
 
-    :param folder: where to write them; the last two stay
+    :param folder: folder of the checkpoints; the last two stay
     :param save_freq: rounds between them
     :raises ValueError: for ``save_freq`` below one
-    :raises CheckpointError: at the start of training, where the run cannot be saved
+    :raises CheckpointError: at the start of training, if the run cannot be saved
     """
 
     def __init__(self, folder: str | Path, save_freq: int = 10) -> None:
@@ -47,7 +47,7 @@ class CheckpointCallback(RoundCallback):
         remove_leftovers(self.folder)
         remove_old(self.folder)
         try:
-            self._state()  # what cannot be saved is said now and not after `save_freq` rounds
+            self._state()  # an error of saving is raised now, not after `save_freq` rounds
         except ValueError as error:
             raise CheckpointError(f"{error} (or train without checkpoints: --save-freq 0 on the command line)") from error
 
@@ -59,7 +59,7 @@ class CheckpointCallback(RoundCallback):
     def save(self) -> bool:
         """Write a checkpoint of the round that has just ended, unless there is one.
 
-        :return: false where it could not be written, after a warning: training goes on, and so may the next checkpoint
+        :return: false if it could not be written, after a warning: training goes on, and the next checkpoint may succeed
         """
         if self.saved_round == self.model.round:
             return True

@@ -19,7 +19,7 @@ ACTOR_PREFIXES, CRITIC_PREFIXES = DDPG_ACTOR, DDPG_CRITIC
 
 
 def check_ddpg_actions(space: spaces.Space) -> None:
-    """:raises ValueError: for actions that no deterministic gradient reaches"""
+    """:raises ValueError: for actions without a deterministic policy gradient"""
     check_continuous(space, "DDPG", "use a method on PPO: FedAvg, FedProx, FedKL, FedSVRPGM or Local")
 
 
@@ -104,7 +104,7 @@ class StackedDDPGPolicy(StackedPolicy, TD3Policy):
             module.optimizer = self.optimizer_class(module.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
         for module in (self.actor_target, self.critic_target):
             module.requires_grad_(False)
-        # Kept, because to walk through the modules takes as long as some of what is computed with them.
+        # Stored, because iterating over the modules takes as long as some of the computations with them.
         self.actor_parameters = list(self.actor.parameters())
         self._networks: list[th.Tensor] = [*self.actor.parameters(), *self.critic.parameters()]
         self._targets: list[th.Tensor] = [*self.actor_target.parameters(), *self.critic_target.parameters()]
@@ -149,7 +149,7 @@ class StackedDDPGPolicy(StackedPolicy, TD3Policy):
                 self.get_parameter(f"{owner}_target.{rest}")[index] = parameter[index]
 
     def bounded_actors(self) -> BoundedActor:
-        """A copy of the actors by themselves, in the action space's own units."""
+        """A copy of the actors alone, in the action space's own units."""
         assert isinstance(self.action_space, spaces.Box)
         return BoundedActor(copy.deepcopy(self.actor.mu), self.action_space)
 

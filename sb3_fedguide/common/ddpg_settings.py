@@ -1,4 +1,4 @@
-"""Which settings of DDPG fit together."""
+"""Check that settings of DDPG fit together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How an actor's outputs become actions: one family of distributions for each kind of action space."""
+"""Distributions over actions from an actor's outputs: one family for each kind of action space."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sb3_fedguide.common import gaussian
 class ActionDistribution(ABC):
     """Distributions over actions with a leading client dimension.
 
-    What an actor gives for a state are its outputs, ``(n_clients, batch, n_outputs)``: a Gaussian's means, or logits.
+    An actor's outputs for a state are ``(n_clients, batch, n_outputs)``: a Gaussian's means, or logits.
     ``log_std`` is ``(n_clients, action_dim)``, and ``None`` for families without one. Actions are
     ``(n_clients, batch, action_dim)``.
 
@@ -33,18 +33,18 @@ class ActionDistribution(ABC):
 
     @abstractmethod
     def decide(self, outputs: th.Tensor) -> th.Tensor:
-        """The most probable actions; of outputs to which noise was added, a sample."""
+        """The most probable actions; for outputs plus noise, a sample."""
 
     @abstractmethod
     def noise(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        """What makes outputs a sample's, float32; before it is multiplied by the standard deviation where there is one."""
+        """The noise that makes a sample of outputs, float32, before its multiplication by the standard deviation (if any)."""
 
     @abstractmethod
     def noise_like(self, outputs: th.Tensor) -> th.Tensor:
         """As :meth:`noise`, from PyTorch's own generator."""
 
     def executed(self, actions: np.ndarray) -> np.ndarray:
-        """What environments take for actions ``(..., action_dim)``, one row after the other."""
+        """Actions ``(..., action_dim)`` in the form that environments take, row by row."""
         return actions.astype(self.space.dtype, copy=False).reshape(-1, *self.space.shape)  # type: ignore[misc]
 
     @abstractmethod
@@ -183,13 +183,13 @@ def action_distribution(space: spaces.Space) -> ActionDistribution:
         return Bernoulli(space)
     raise ValueError(
         f"actions must be a one-dimensional Box, MultiDiscrete or MultiBinary space or a Discrete one, counted from 0, but "
-        f"the action space is {space}; gymnasium.wrappers.TransformAction makes one of another"
+        f"the action space is {space}; convert it with gymnasium.wrappers.TransformAction"
     )
 
 
 def check_continuous(space: spaces.Space, what: str, instead: str) -> None:
-    """:param what: that needs continuous actions
-    :param instead: what to do where they are not
+    """:param what: the part that needs continuous actions
+    :param instead: the remedy if they are not
     :raises ValueError: for actions that are not a flat ``Box``
     """
     if not isinstance(action_distribution(space), Gaussian):

@@ -1,4 +1,4 @@
-"""What a federation's environments are made of, and which ones fit a model that exists already."""
+"""Make a federation's environments, and check that they fit an existing model."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 class FederatedEnvironments(BaseAlgorithm):
-    """Mixin of a federation: its policies meet the environments of their own clients, whatever it is given.
+    """Mixin of a federation: matches its policies with the environments of their own clients.
 
-    Environments of the same clients in another order are put into the model's. A family's name, a metadata file or a list
-    of factories stands for all of its clients: those that live here are taken, with as many copies as before.
+    Environments of the same clients in another order are put into the model's order. A family's name, a metadata file or a
+    list of factories has all of its clients: the model takes its own ones, with as many copies as before.
     """
 
     client_ids: list[int]
@@ -34,7 +34,7 @@ class FederatedEnvironments(BaseAlgorithm):
 
     @abstractmethod
     def _fit_copies(self) -> None:
-        """Make anew what is as large as the number of environments per client, after that has changed."""
+        """Make anew all arrays that depend on the number of environments per client, after it has changed."""
 
     @classmethod
     def load(  # type: ignore[override]  # one VecEnv of SB3's holds a single client
@@ -47,9 +47,9 @@ class FederatedEnvironments(BaseAlgorithm):
         force_reset: bool = True,
         **kwargs: Any,
     ) -> Any:
-        """As in SB3, whose archive is unpickled: it can execute any code, so load only what you trust.
+        """As in SB3, whose archive is unpickled: it can execute any code, so load only archives that you trust.
 
-        :meth:`import_parameters` reads a file of :meth:`export_parameters` from anybody.
+        :meth:`import_parameters` safely reads a file of :meth:`export_parameters` from any source.
 
         :param env: environments of the same clients; a ``FederatedVecEnv`` may have another number of copies per client
         :raises ValueError: for environments of other clients or of another family, and for another version's archive
@@ -81,7 +81,7 @@ class FederatedEnvironments(BaseAlgorithm):
         matching = self._matching(env)
         if matching.n_envs_per_client != self.n_envs_per_client:
             raise ValueError(
-                f"set_env() keeps the number of environments per client, {self.n_envs_per_client} and not "
+                f"set_env() keeps the number of environments per client: {self.n_envs_per_client}, not "
                 f"{matching.n_envs_per_client}; {type(self).__name__}.load(path, env=...) takes another"
             )
         super().set_env(matching, force_reset)
@@ -96,7 +96,7 @@ class FederatedEnvironments(BaseAlgorithm):
         if own != theirs:
             raise ValueError(
                 f"the environments are of {theirs}, and this {type(self).__name__} is a federation of {own}: the policies of "
-                "its clients would play others' environments. To start from what these have learned, make a new model of "
+                "its clients would act in others' environments. To start from their parameters, make a new model of "
                 "those environments, and use export_parameters() and import_parameters()"
             )
         if set(env.client_ids) != set(self.client_ids):
@@ -113,14 +113,14 @@ class FederatedEnvironments(BaseAlgorithm):
 
     @staticmethod
     def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        """Accept whatever a federation can be made of wherever SB3 takes an environment."""
+        """Accept all forms of a federation's environments, also as SB3's ``env`` argument."""
         wrapped = as_federated_env(env)
         assert wrapped is not None
         return BaseAlgorithm._wrap_env(wrapped, verbose, monitor_wrapper)
 
 
 def check_copies(rollout_size: int, n_envs_per_client: int) -> None:
-    """:raises ValueError: where a round's steps cannot be divided among a client's environments"""
+    """:raises ValueError: if a round's steps cannot be divided among a client's environments"""
     if rollout_size < 1 or rollout_size % n_envs_per_client:
         raise ValueError(
             f"n_envs_per_client={n_envs_per_client} must divide rollout_size={rollout_size}, the steps per client and round"
@@ -157,5 +157,5 @@ def as_federated_env(
 
 
 def _name(family: Family | None) -> str:
-    """What tells one family from another."""
+    """A name that distinguishes families."""
     return "functions of your own" if family is None else f"the family {family.name} ({family.content_hash[:12]})"

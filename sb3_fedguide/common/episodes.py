@@ -1,4 +1,4 @@
-"""Finished training episodes: each client's own, what is logged of them, and SB3's buffers of all of them together."""
+"""Finished training episodes: each client's own, their log, and SB3's buffers of all clients together."""
 
 from __future__ import annotations
 
@@ -24,41 +24,41 @@ class EpisodeStatistics(BaseAlgorithm):
     """Mixin of a federation: its clients' last finished episodes, and the round's log.
 
     SB3's ``ep_info_buffer`` and ``ep_success_buffer`` hold the last ones of all clients together, for callbacks that read
-    them; what is logged comes from ``episode_infos``, each client's own.
+    them; the log uses each client's own, ``episode_infos``.
     """
 
     client_ids: list[int]
-    #: environment steps of tests, see :mod:`sb3_fedguide.common.screening`, which ``num_timesteps`` leaves out
+    #: environment steps of tests (:mod:`sb3_fedguide.common.screening`); ``num_timesteps`` does not count them
     test_steps = 0
 
     @property
     def environment_steps(self) -> int:
-        """Steps of all clients together, in training and in tests of what the server sent."""
+        """Steps of all clients together, in training and in tests of broadcasts."""
         return self.num_timesteps + self.test_steps
 
     def begin_episodes(self) -> None:
         """Forget all finished episodes."""
-        #: of each client, with ``is_success`` where its environment knows a success
+        #: of each client, with ``is_success`` if its environment reports it
         self.episode_infos: list[deque[dict[str, float]]] = [
             deque(maxlen=self._stats_window_size) for _ in range(len(self.client_ids))
         ]
 
     def note_episode(self, client: int, info: dict[str, Any]) -> None:
-        """Remember the episode that a step of the client at position ``client`` has ended.
+        """Remember a finished episode of the client at position ``client``.
 
-        :param info: the step's
+        :param info: of its last step
         """
         if "episode" not in info:
             return
         success = info.get("is_success")
-        episode = {name: info["episode"][name] for name in ("r", "l", "t")}  # what else it says may be anything
+        episode = {name: info["episode"][name] for name in ("r", "l", "t")}  # other entries may be anything
         if success is not None:
             episode["is_success"] = float(truth(success, self.client_ids[client]))
         self.episode_infos[client].append(episode)
         self._share(episode)
 
     def gather_episodes(self) -> None:
-        """Fill SB3's buffers from ``episode_infos``, where the episodes were played elsewhere or before a resume."""
+        """Fill SB3's buffers from ``episode_infos``, if other processes played the episodes or after a resume."""
         assert self.ep_info_buffer is not None and self.ep_success_buffer is not None
         self.ep_info_buffer.clear()
         self.ep_success_buffer.clear()
@@ -67,18 +67,18 @@ class EpisodeStatistics(BaseAlgorithm):
 
     def _share(self, episode: dict[str, float]) -> None:
         if self.ep_info_buffer is None or self.ep_success_buffer is None:
-            return  # in an engine's worker, where nobody reads them
+            return  # in an engine's worker: nobody reads them there
         self.ep_info_buffer.append(episode)
         if "is_success" in episode:
             self.ep_success_buffer.append(episode["is_success"])
 
     def mean_episode_return(self) -> float:
-        """Average over clients of each one's mean return over its last finished training episodes."""
+        """Average over clients of their mean return over the last finished training episodes."""
         means = self._client_means("r")
         return float(np.mean(list(means.values()))) if means else float("nan")
 
     def _client_means(self, key: str) -> dict[int, float]:
-        """Client id to the mean of ``key`` over its last finished episodes, of those that have any."""
+        """Client id to the mean of ``key`` over its last finished episodes, for clients with any."""
         means = {}
         for client, infos in zip(self.client_ids, self.episode_infos, strict=True):
             values = [info[key] for info in infos if key in info]
@@ -106,5 +106,5 @@ class EpisodeStatistics(BaseAlgorithm):
         self.logger.dump(step=self.environment_steps)
 
     def record_client(self, client_id: int, key: str, value: float) -> None:
-        """Log one client's value; kept off the terminal, where long keys collide and eight clients drown the rest."""
+        """Log one client's value, but not on the terminal: long keys collide there, and eight clients fill it."""
         self.logger.record(f"client_{client_id}/{key}", value, exclude=("stdout", "log"))

@@ -22,7 +22,7 @@ from sb3_fedguide.settings.evaluation import EVAL_EPISODES, EVAL_FREQ, broadcast
 if TYPE_CHECKING:
     from sb3_fedguide.common.federation import Federation
 
-#: Steps after which an episode of an evaluation is taken for one that never ends.
+#: Steps after which an evaluation episode counts as endless.
 MAX_STEPS = 100_000
 
 
@@ -32,8 +32,8 @@ class Evaluation:
 
     :param returns: undiscounted raw returns, ``(n_clients, n_episodes)``
     :param lengths: steps, ``(n_clients, n_episodes)``
-    :param successes: whether each episode succeeded, ``(n_clients, n_episodes)`` bool; ``None`` where no environment says.
-        Where only some clients' do, it is float with NaN for the others
+    :param successes: whether each episode succeeded, ``(n_clients, n_episodes)`` bool; ``None`` if no environment reports it.
+        If only some clients' environments do, it is float with NaN for the others
     """
 
     returns: np.ndarray
@@ -47,18 +47,18 @@ class Evaluation:
 
     @property
     def average(self) -> float:
-        """The client-average return: the measure F where the round is the last."""
+        """The client-average return: in the last round, the measure F."""
         return float(self.client_returns.mean())
 
     @property
     def success_rates(self) -> np.ndarray | None:
-        """Share of each client's episodes that succeeded, ``(n_clients,)``; ``None`` where no environment says, NaN where a
-        client's does not."""
+        """Share of each client's episodes that succeeded, ``(n_clients,)``; ``None`` if no environment reports success, NaN
+        for clients whose environment does not."""
         return None if self.successes is None else self.successes.mean(axis=1)
 
     @property
     def success_list(self) -> list[float | None] | None:
-        """:attr:`success_rates` for JSON, with ``None`` for the clients whose environments do not say."""
+        """:attr:`success_rates` for JSON, with ``None`` for clients whose environment does not report success."""
         rates = self.success_rates
         return None if rates is None else [None if np.isnan(rate) else float(rate) for rate in rates]
 
@@ -86,9 +86,9 @@ def evaluate_federation(
     :param predict: actions for observations ``(num_envs, obs_dim)``, client-major
     :param env: one copy per client and episode
     :param seed: of the episodes
-    :param active: ``(n_clients, n_episodes)`` bool, which of them to run; all if ``None``. Of the others nothing is known
+    :param active: ``(n_clients, n_episodes)`` bool, episodes to run; all if ``None``. Results of the others are undefined
     :param max_steps: of an episode
-    :raises ClientError: for the clients one of whose episodes does not end before
+    :raises ClientError: for clients with an episode that does not end before
     """
     env.seed(seed)
     env.active[:] = True if active is None else active.reshape(-1)
@@ -117,7 +117,7 @@ def evaluate_federation(
 
 
 def _successes(successes: np.ndarray, say: np.ndarray) -> np.ndarray | None:
-    """As :class:`Evaluation` has them. A client that says so of some episodes had no success in the others."""
+    """As in :class:`Evaluation`. If a client reports success for some episodes, the others had none."""
     if not say.any():
         return None
     silent = np.flatnonzero(say.sum(axis=1) == 0)
@@ -131,8 +131,8 @@ def _successes(successes: np.ndarray, say: np.ndarray) -> np.ndarray | None:
 class FederatedEvalCallback(RoundCallback):
     """Evaluates the deployed policies every ``eval_freq`` rounds and in each of the last twenty, and writes a CSV.
 
-    The deployed policy is a client's own after local training. Where the exchange of an evaluated round replaces the
-    policies, the broadcast one is evaluated as well, every ``eval_freq`` rounds and after the last.
+    The deployed policy is a client's own after local training. If the exchange of an evaluated round replaces the
+    policies, the broadcast policy is evaluated as well, every ``eval_freq`` rounds and after the last.
 
     :param n_rounds: rounds of the whole run
     :param eval_freq: rounds between evaluations
@@ -165,9 +165,9 @@ class FederatedEvalCallback(RoundCallback):
         return {**super().save_state(), "evaluations": evaluations, "csv_size": size}
 
     def load_state(self, state: State) -> None:
-        """Rows that were written after the state was taken are cut off: they will be written again.
+        """Remove rows that were written after the state was saved: they will be written again.
 
-        :raises ValueError: where rows are missing that the state counts on
+        :raises ValueError: if rows are missing that were written before
         """
         super().load_state({name: state[name] for name in state.keys() - {"evaluations", "csv_size"}})
         self.last = {policy: Evaluation(**thaw(values)) for policy, values in state["evaluations"].items()}
@@ -201,7 +201,7 @@ class FederatedEvalCallback(RoundCallback):
     def _on_round_end(self) -> None:
         round = self.model.round
         if not self.model.sends_policy(round):
-            self.last.pop("broadcast", None)  # nobody has that policy any more
+            self.last.pop("broadcast", None)  # no client has that policy now
         elif broadcast_is_due(round, self.n_rounds, self.eval_freq):
             evaluation = self._evaluate("broadcast", round)
             self.logger.record("eval/broadcast_mean_reward", evaluation.average)

@@ -1,4 +1,4 @@
-"""What a federation's clients send to the server and take from it, and the server's side that belongs to the method."""
+"""The exchange of a federation's clients with the server, and the server's side of the method."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from sb3_fedguide.server.strategy import Payload, Strategy
 
 
 class Exchange(BaseAlgorithm):
-    """Mixin of a federation. A method defines :meth:`upload` and :meth:`receive`; whatever carries payloads calls
-    :meth:`outgoing` and :meth:`take_broadcasts`, which add what every method has.
+    """Mixin of a federation. A method defines :meth:`upload` and :meth:`receive`; a transport calls :meth:`outgoing` and
+    :meth:`take_broadcasts`, which add the parts that all methods share.
     """
 
-    #: whether every client's data may stay where it is; what is not federated cannot be divided among processes or machines
+    #: whether every client's data stays with it; otherwise the method cannot be divided among processes or machines
     is_federated: ClassVar[bool] = True
     strategy: Strategy | None
     upload_bound: float | None
@@ -27,7 +27,7 @@ class Exchange(BaseAlgorithm):
     client_ids: list[int]
 
     def sends_policy(self, round: int) -> bool:
-        """Whether the exchange after round ``round`` replaces the clients' policies; what it sent is evaluated as well."""
+        """Whether the exchange after round ``round`` replaces the clients' policies; the broadcast is then evaluated too."""
         return False
 
     def _start_server(self) -> None:
@@ -38,13 +38,13 @@ class Exchange(BaseAlgorithm):
                 self.strategy.upload_bound = self.upload_bound
 
     def _make_strategy(self) -> Strategy | None:
-        """The server's side of this method; ``None`` where nothing is exchanged."""
+        """The server's side of this method; ``None`` if nothing is exchanged."""
         assert self.seed is not None
         return make_strategy(method_of(type(self)), self.server_settings(), len(self.client_ids), self.seed)
 
     @classmethod
     def registered_method(cls) -> Method:
-        """The server's side by which a server without this model makes its strategy.
+        """The method from which a server without this model makes its strategy.
 
         :raises ValueError: for a class that makes its strategy itself
         """
@@ -56,50 +56,50 @@ class Exchange(BaseAlgorithm):
         return method_of(cls)
 
     def server_settings(self) -> dict[str, Any]:
-        """What the server of this method has to know, by the names of the constructor's parameters."""
+        """The settings that this method's server needs, by the names of the constructor's parameters."""
         method = method_of(type(self))
         return complete_settings(method, {name: getattr(self, name) for name in (*COMMON, *method.defaults)})
 
     def upload(self, index: int) -> Payload:
-        """What the client at position ``index`` sends of its method: float32 arrays and nothing else."""
+        """The method's upload of the client at position ``index``: only float32 arrays."""
         return {}
 
     def receive(self, index: int, broadcast: Payload) -> None:
-        """Take what the server sent of this method to the client at position ``index``."""
+        """Apply the method's broadcast to the client at position ``index``."""
 
     def upload_shapes(self) -> dict[str, list[int]]:
-        """Shapes of what a client uploads by name, known before the offline stage; what only comes later is left out."""
+        """Shapes of a client's upload by name, known before the offline stage; arrays that only come later are left out."""
         return {name: list(array.shape) for name, array in self.upload(0).items()}
 
     def outgoing(self, index: int) -> Payload:
-        """All that the client at position ``index`` sends: :meth:`upload`, and its round's moments where they are shared."""
+        """The whole upload of the client at position ``index``: :meth:`upload`, and its round's moments if they are shared."""
         return {**self.upload(index), **self.normalizer.round_moments(index)}
 
     @property
     def protects_uploads(self) -> bool:
-        """Whether what a client uploads has noise, so that nothing else of it may leave the client."""
+        """Whether uploads have noise, so that nothing else may leave the client."""
         return False
 
     def upload_metrics(self, public: bool = False) -> dict[str, float]:
-        """What is to be logged of this round's uploads, by log key.
+        """Metrics of this round's uploads, by log key.
 
-        :param public: only what tells nothing of them
+        :param public: only metrics that reveal nothing about them
         """
         return {}
 
     def upload_summary(self) -> dict[str, Any]:
-        """What is to be said of all uploads at the end of a run, as plain data; nothing where there is nothing to say."""
+        """Summary of all uploads at the end of a run, as plain data; may be empty."""
         return {}
 
     def draw_secret_keys(self) -> None:
-        """Let the noise of uploads be unknown to whoever knows the seed; called where a client is on a machine of its own."""
+        """Make the noise of uploads independent of the seed; called if a client is on its own machine."""
 
     def test_work(self) -> np.ndarray | None:
-        """Environment steps of each client's tests since it was last asked, in rounds, ``(n_clients,)``; ``None`` for none."""
+        """Environment steps of each client's tests since the last call, in rounds, ``(n_clients,)``; ``None`` for none."""
         return None
 
     def take_broadcasts(self, broadcasts: Mapping[int, Payload]) -> None:
-        """Take all that the server sent.
+        """Apply all broadcasts of the server.
 
         :param broadcasts: by the client's position
         """
@@ -113,5 +113,5 @@ class Exchange(BaseAlgorithm):
             self.receive(index, broadcast)
 
     def _accepted(self, broadcasts: Mapping[int, Payload]) -> Mapping[int, Payload]:
-        """What the clients take of what they were sent, by position."""
+        """The broadcasts that the clients accept, by position."""
         return broadcasts

@@ -27,7 +27,7 @@ from sb3_fedguide.common.spaces import is_plain
 
 logger = logging.getLogger(__name__)
 
-#: what further training takes over from the federation, by SB3's names
+#: settings of the federation that further training keeps, by SB3's names
 SETTINGS: dict[str, tuple[str, ...]] = {
     "PPO": (
         "learning_rate", "n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "clip_range", "clip_range_vf",
@@ -42,7 +42,7 @@ SETTINGS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Normalization:
-    """``clip((obs - mean) / deviation, -clip, clip)``, in float64, of flattened observations.
+    """``clip((obs - mean) / deviation, -clip, clip)`` of flattened observations, in float64.
 
     :param mean: ``(obs_dim,)``, like ``deviation``
     """
@@ -53,13 +53,13 @@ class Normalization:
 
     @classmethod
     def of(cls, mean: np.ndarray, var: np.ndarray) -> Normalization:
-        """That of a client's running moments, as :meth:`FederatedNormalizer.normalize_obs` applies it."""
+        """Made from a client's running moments, as in :meth:`FederatedNormalizer.normalize_obs`."""
         return cls(mean, np.sqrt(var + FederatedNormalizer.EPSILON), FederatedNormalizer.CLIP)
 
 
 @dataclass(frozen=True)
 class ClientPolicy:
-    """All of one client's policy, from which it can be built anywhere.
+    """Everything that is needed to build one client's policy anywhere.
 
     :param learner: ``"PPO"`` or ``"DDPG"``
     :param observation_space: of the client's own environment
@@ -76,14 +76,14 @@ class ClientPolicy:
     normalization: Normalization | None
     settings: dict[str, Any] = field(default_factory=dict)
     seed: int | None = None
-    #: of the policy, for further training alone
+    #: of the policy, only for further training
     network: dict[str, Any] = field(default_factory=dict)
 
     def to_sb3(self) -> PPO | DDPG:
-        """An ordinary model that takes what the environment returns; ``set_env`` gives it one to train in.
+        """An ordinary model that takes the environment's own observations; ``set_env`` gives it one to train in.
 
-        Networks and normalisation are copied; Adam's moments are not, so that further training starts fresh. Saved, it
-        loads wherever Stable-Baselines3 is installed.
+        Networks and normalisation are copied; Adam's moments are not, so further training starts without them. Once saved,
+        the model loads wherever Stable-Baselines3 is installed.
         """
         settings = dict(self.settings)
         if noise := {name: settings.pop(f"noise_{name}") for name in ("sigma", "theta", "dt") if f"noise_{name}" in settings}:
@@ -138,11 +138,11 @@ class ClientPolicy:
 
 
 def features_extractor(space: spaces.Space, normalization: Normalization | None) -> type[FlattenExtractor]:
-    """A features extractor class that flattens observations and normalises them, and unpickles where this package is not.
+    """A features extractor class that flattens observations and normalises them, and unpickles without this package.
 
-    SB3's archive holds the class itself. Pickle writes a class by its module's name, and cloudpickle that of ``__main__``
-    with all of its functions' bytecode, which no other version of Python runs; so this one has no function of its own:
-    what ``FlattenExtractor`` calls as ``self.flatten`` is an ``fx.GraphModule``, which pickles as source code.
+    SB3's archive holds the class itself. Pickle writes a class by its module's name; cloudpickle writes a class of
+    ``__main__`` with its functions' bytecode, which no other version of Python runs. So this class has no function of its
+    own: ``self.flatten``, which ``FlattenExtractor`` calls, is an ``fx.GraphModule``, which pickles as source code.
     """
     graph = fx.Graph()
     observations = graph.placeholder("observations")
@@ -152,7 +152,7 @@ def features_extractor(space: spaces.Space, normalization: Normalization | None)
     features = graph.call_function(th.cat, ([graph.call_function(th.flatten, (part, 1)) for part in parts], 1))
     root = nn.Module()
     if normalization is not None:
-        # Of the class and not of its instances, the constants stay on the CPU, and so load everywhere.
+        # As attributes of the class, not of its instances, the constants stay on the CPU, and so load everywhere.
         root.register_buffer("mean", th.as_tensor(normalization.mean))
         root.register_buffer("deviation", th.as_tensor(normalization.deviation))
         device = graph.call_function(getattr, (features, "device"))
@@ -166,10 +166,10 @@ def features_extractor(space: spaces.Space, normalization: Normalization | None)
 
 
 class DeployedPolicy(nn.Module):
-    """A client's deterministic policy from raw observations to executed actions, free of SB3 and of this package.
+    """A client's deterministic policy from raw observations to executed actions; needs neither SB3 nor this package.
 
-    ``(batch, obs_dim)`` float32, flattened as by ``gymnasium.spaces.flatten``, to what the environment takes, row by row:
-    ``(batch, action_dim)`` float32 within the bounds, or whole numbers, ``(batch,)`` for a Discrete space.
+    It maps ``(batch, obs_dim)`` float32, flattened as by ``gymnasium.spaces.flatten``, to actions for the environment, row by
+    row: ``(batch, action_dim)`` float32 within the bounds, or integers, ``(batch,)`` for a Discrete space.
     """
 
     mean: th.Tensor
@@ -207,13 +207,13 @@ class DeployedPolicy(nn.Module):
 
 
 def write_policy(policy: ClientPolicy, path: str | Path) -> None:
-    """Write a policy in the form that the suffix of ``path`` says, complete or not at all.
+    """Write a policy in the format of ``path``'s suffix, complete or not at all.
 
-    :raises ValueError: for another suffix, or where a package is missing
+    :raises ValueError: for another suffix, or if a package is missing
     """
     path = Path(path)
     if path.suffix not in FORMATS:
-        raise ValueError(f"{path}: the suffix says the form, and has to be {', '.join(FORMATS)}")
+        raise ValueError(f"{path}: the suffix selects the format, and must be one of {', '.join(FORMATS)}")
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path, "wb") as file:
         FORMATS[path.suffix](policy, file)
@@ -261,7 +261,7 @@ def _traceable(policy: ClientPolicy) -> tuple[DeployedPolicy, th.Tensor]:
     return policy.module(), th.zeros(2, policy.obs_dim)
 
 
-#: How a policy is written, by the suffix of the file: SB3's archive, a ``torch.export`` program, TorchScript, ONNX.
+#: Writers of a policy, by the suffix of the file: SB3's archive, a ``torch.export`` program, TorchScript, ONNX.
 FORMATS: dict[str, Callable[[ClientPolicy, Any], None]] = {
     ".zip": _write_sb3,
     ".pt2": _write_program,
@@ -271,13 +271,13 @@ FORMATS: dict[str, Callable[[ClientPolicy, Any], None]] = {
 
 
 def client_settings(model: Any) -> dict[str, Any]:
-    """What a client's own model takes over of a federation's hyperparameters; it has one environment."""
+    """The federation's hyperparameters that a client's own model keeps; it has one environment."""
     settings = {name: getattr(model, name) for name in SETTINGS[model.learner]}
     return {**settings, "n_steps": model.rollout_size} if "n_steps" in settings else settings
 
 
 class ClientPolicies(BaseAlgorithm):
-    """Mixin of a federation that gives its clients' policies away."""
+    """Mixin of a federation that exports its clients' policies."""
 
     policy: Any
     normalizer: FederatedNormalizer
@@ -288,7 +288,7 @@ class ClientPolicies(BaseAlgorithm):
     def client(self, client_id: int) -> PPO | DDPG:
         """Client ``client_id``'s policy as an ordinary ``stable_baselines3`` model that takes raw observations.
 
-        Networks and normalisation are copied; Adam's moments and replay are not. Saved, it loads where this package is not.
+        Networks and normalisation are copied; Adam's moments and replay are not. Once saved, it loads without this package.
 
         :raises ValueError: for a client that does not live here
         """
@@ -297,7 +297,7 @@ class ClientPolicies(BaseAlgorithm):
         return model
 
     def export(self, client_id: int, path: str | Path) -> None:
-        """Write client ``client_id``'s policy in the form that the suffix says; none of them needs this package.
+        """Write client ``client_id``'s policy in the format of the suffix; no format needs this package.
 
         ``.zip`` is :meth:`client` in SB3's archive. The others map raw observations, flattened, to executed actions:
         ``.pt2`` for ``torch.export.load(path).module()``, ``.pt`` for ``torch.jit.load``, ``.onnx`` for ONNX.
@@ -334,17 +334,17 @@ class ClientPolicies(BaseAlgorithm):
     def _network_settings(self) -> dict[str, Any]:
         names = ("optimizer_class", "optimizer_kwargs", "ortho_init", "log_std_init")
         found = {name: getattr(self.policy, name) for name in names if hasattr(self.policy, name)}
-        if found["optimizer_class"] is ParticipationAdam:  # Adam, for clients that come and go
+        if found["optimizer_class"] is ParticipationAdam:  # Adam, for partial participation
             found["optimizer_class"] = th.optim.Adam
         return found
 
     @property
     def learner(self) -> str:
-        """The class of SB3's that a client's policy belongs to."""
+        """The SB3 class of a client's policy."""
         return "DDPG" if isinstance(self, DDPG) else "PPO"
 
     @property
     def client_observation_space(self) -> spaces.Space:
-        """What a client's policy takes: the environments' own observations, or flattened ones where SB3 knows no such."""
+        """A client's policy takes the environments' own observations, or flattened ones if SB3 does not support them."""
         raw = self.raw_observation_space
         return raw if raw is not None and is_plain(raw) else self.observation_space

@@ -1,4 +1,4 @@
-"""Checks, once per round, of what came from the environments and of what was learned from it."""
+"""Checks, once per round, of the environments' outputs and of the trained policies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fed_envs.faults import ClientError
 
 @contextmanager
 def in_round(round: int) -> Iterator[None]:
-    """Errors of clients name the round."""
+    """Add the round to errors of clients."""
     try:
         yield
     except ClientError as error:
@@ -23,18 +23,18 @@ def in_round(round: int) -> Iterator[None]:
 
 
 def warn_of_new_episodes(client_ids: Sequence[int]) -> None:
-    """Say, once for the same clients, whose episodes began anew because their environments give no state."""
+    """Warn, once for the same clients, that their episodes began anew because their environments give no state."""
     if client_ids:
         warnings.warn(
             f"the environments of client{'s' if len(client_ids) > 1 else ''} {', '.join(map(str, client_ids))} give no state, "
-            "so their episodes began anew; with methods save_state() and load_state(state) they would go on exactly",
+            "so their episodes began anew; for an exact resume, give the environments save_state() and load_state(state)",
             stacklevel=2,
         )
 
 
 def check_experience(client_ids: Sequence[int], experience: Mapping[str, np.ndarray]) -> None:
     """:param experience: name to ``(n_steps, n_clients, ...)``, in the order of a round's steps
-    :raises ClientError: for the client whose environment was the first to return what is not finite
+    :raises ClientError: for the client whose environment was the first to return a non-finite value
     """
     first: tuple[int, int, str] | None = None
     for name, array in experience.items():

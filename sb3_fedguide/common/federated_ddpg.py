@@ -41,13 +41,13 @@ class FederatedDDPG(Federation, DDPG):
     has its own replay buffer, exploration noise and random streams, and one stacked gradient step serves them all. Without
     a server ``strategy``, N clients learn exactly as N federations of one, and a gradient step is SB3's.
 
-    The replay buffer is not part of a saved model, as in SB3: a loaded one first fills ``learning_starts`` transitions again,
-    with its own policy, unless ``load_replay_buffer`` brings them back.
+    The replay buffer is not part of a saved model, as in SB3: a loaded model first collects ``learning_starts`` transitions
+    again, with its own policy, unless ``load_replay_buffer`` restores them.
 
     Paper: https://arxiv.org/abs/1509.02971 (DDPG)
 
     :param policy: ``"MlpPolicy"``
-    :param env: what a federation can be made of, as for :class:`FederatedPPO`
+    :param env: as for :class:`FederatedPPO`
     :param learning_rate: of actor and critic
     :param rollout_size: environment steps per client and round
     :param buffer_size: capacity of each client's replay buffer
@@ -57,19 +57,19 @@ class FederatedDDPG(Federation, DDPG):
     :param gamma: discount factor
     :param train_freq: steps of every environment between trainings; must divide ``rollout_size / n_envs_per_client``
     :param gradient_steps: gradient steps each time; -1 for as many as there were new transitions per client
-    :param noise_theta: pull towards zero of the Ornstein-Uhlenbeck exploration noise, in units of actions in [-1, 1]
+    :param noise_theta: rate of mean reversion of the Ornstein-Uhlenbeck exploration noise, in units of actions in [-1, 1]
     :param noise_sigma: its scale
     :param noise_dt: its time step; 1 in the paper, 0.01 in SB3
     :param n_envs_per_client: environments per client; must divide ``rollout_size``
     :param clients: ids of the clients that live here; all by default
-    :param num_threads: at most so many threads step the simulators, see :class:`fed_envs.FederatedVecEnv`
+    :param num_threads: upper bound on the threads that step the simulators, see :class:`fed_envs.FederatedVecEnv`
     :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client; with ``"shared"`` the
         clients pool their observation statistics through the server after every round
     :param bc_weight: alpha of ``theta_0 = (1 - alpha) theta_rand + alpha theta_BC`` for the actor (paper: 0.3)
     :param client_fraction: share of the clients that take part in each round, as for :class:`FederatedPPO`
     :param upload_bound: as for :class:`FederatedPPO`
     :param pretraining: settings of the offline stage, a ``PretrainingConfig`` or a dict of its fields
-    :param cache_dir: where the offline stage keeps its results; by default the user's cache folder
+    :param cache_dir: folder of the offline stage's results; by default the user's cache folder
     :param stats_window_size: finished episodes per client over which returns are averaged
     :param tensorboard_log: as in SB3, like ``policy_kwargs``, ``verbose`` and ``device``
     :param seed: the federation's seed; drawn and stored if ``None``
@@ -77,7 +77,7 @@ class FederatedDDPG(Federation, DDPG):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(FederatedDDPGArguments.policies, StackedDDPGPolicy)
-    #: whose settings an algorithm of the user's own starts from, where it has none
+    #: the algorithm whose settings a user's own algorithm takes if it has none
     base_settings: ClassVar[str | None] = None
     replay_buffer: FederatedReplayBuffer | None  # type: ignore[assignment]
     policy: StackedDDPGPolicy
@@ -93,7 +93,7 @@ class FederatedDDPG(Federation, DDPG):
             check_ddpg_actions(env.action_space)
         self.rollout_size = given.rollout_size
         self.noise_theta, self.noise_sigma, self.noise_dt = given.noise_theta, given.noise_sigma, given.noise_dt
-        #: steps that each client has taken in its life, ``(n_clients,)``
+        #: steps that each client has taken so far, ``(n_clients,)``
         self.client_steps = np.zeros(self.n_clients, dtype=int)
         super().__init__(
             given.policy,  # type: ignore[arg-type]
@@ -166,7 +166,7 @@ class FederatedDDPG(Federation, DDPG):
         self.replay_buffer.n_envs_per_client, self.replay_buffer.n_envs = self.n_envs_per_client, self.n_envs
 
     def load_replay_buffer(self, path: str | Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """As in SB3, whose file is unpickled: load only what you trust.
+        """As in SB3, whose file is unpickled: load only files that you trust.
 
         :raises ValueError: for other clients' transitions
         """
@@ -264,12 +264,12 @@ class FederatedDDPG(Federation, DDPG):
         return np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
 
     def _ready(self) -> np.ndarray:
-        """Who takes part and has the transitions to learn from, ``(n_clients,)`` bool."""
+        """The participants with enough transitions to learn from, ``(n_clients,)`` bool."""
         assert self.replay_buffer is not None
         return self.present & (self.replay_buffer.sizes > self.learning_starts)
 
     def _ends(self, next_obs: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-        """What the transitions led to, before any reset, and whether it was terminal; keeps finished episodes' infos."""
+        """Next observations, before any reset, and whether they are terminal; keeps finished episodes' infos."""
         terminations = dones.copy()
         if dones.any():
             next_obs = next_obs.copy()
@@ -307,7 +307,7 @@ class FederatedDDPG(Federation, DDPG):
             self.critic.optimizer.step()
 
             actor_loss = -self.policy.values(data.observations, self.policy.actions(data.observations)).mean(dim=1)
-            # Only the actors' gradients: those of the critics' weights would be computed for nothing.
+            # Only the actors' gradients: those of the critics' weights are not needed.
             gradients = th.autograd.grad(actor_loss.sum(), actor_parameters)
             for parameter, gradient in zip(actor_parameters, gradients, strict=True):
                 parameter.grad = gradient

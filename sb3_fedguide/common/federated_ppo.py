@@ -35,7 +35,7 @@ from sb3_fedguide.state.stacked import clip_grad_norm_per_client
 class FederatedPPO(Federation, PPO):
     """PPO for every client of a family at once; the base class of every on-policy method.
 
-    One rollout and one ``train()`` is one communication round. A method adds to it by a few hooks: a server ``strategy``
+    One rollout and one ``train()`` are one communication round. A method extends it with a few hooks: a server ``strategy``
     with ``upload`` and ``receive``, :meth:`_prepare_training`, :meth:`_extra_losses` and :meth:`_transform_gradients`.
     Without them, N clients learn exactly as N separate SB3 PPO runs.
 
@@ -54,16 +54,16 @@ class FederatedPPO(Federation, PPO):
     :param max_grad_norm: bound on each client's own gradient norm
     :param n_envs_per_client: environments per client; must divide ``rollout_size``
     :param clients: ids of the clients that live here; all by default
-    :param num_threads: at most so many threads step the simulators, see :class:`fed_envs.FederatedVecEnv`
+    :param num_threads: upper bound on the threads that step the simulators, see :class:`fed_envs.FederatedVecEnv`
     :param normalize: running normalisation of observations and rewards, as ``VecNormalize``, per client; with ``"shared"`` the
         clients pool their observation statistics through the server after every round
     :param bc_weight: alpha of ``theta_0 = (1 - alpha) theta_rand + alpha theta_BC`` for the actor (paper: 0.3)
     :param client_fraction: share of the clients that take part in each round, drawn by the server; the others keep all of
-        their state, and receive what they missed before they train again
-    :param upload_bound: how far norms of uploads may exceed the clients' median before the server rejects them, see
+        their state, and receive the missed broadcast before they train again
+    :param upload_bound: bound on norms of uploads above the clients' median, beyond which the server rejects them, see
         :func:`~sb3_fedguide.server.validation.check_uploads`; ``None`` leaves out all checks of uploads
     :param pretraining: settings of the offline stage, a ``PretrainingConfig`` or a dict of its fields
-    :param cache_dir: where the offline stage keeps its results; by default the user's cache folder
+    :param cache_dir: folder of the offline stage's results; by default the user's cache folder
     :param stats_window_size: finished episodes per client over which returns are averaged
     :param tensorboard_log: as in SB3, like ``policy_kwargs``, ``verbose`` and ``device``
     :param seed: the federation's seed; drawn and stored if ``None``
@@ -71,7 +71,7 @@ class FederatedPPO(Federation, PPO):
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = dict.fromkeys(FederatedPPOArguments.policies, StackedMlpPolicy)
-    #: whose settings an algorithm of the user's own starts from, where it has none
+    #: the algorithm whose settings a user's own algorithm takes if it has none
     base_settings: ClassVar[str | None] = "local"
     rollout_buffer: FederatedRolloutBuffer  # type: ignore[assignment]
     policy: StackedMlpPolicy
@@ -86,7 +86,7 @@ class FederatedPPO(Federation, PPO):
             self._check_actions(env)
         self.rollout_size = given.rollout_size
         with warnings.catch_warnings():
-            # SB3 takes the clients' rollouts for one and compares its size with a client's minibatch.
+            # SB3 treats the clients' rollouts as one and compares its size with a client's minibatch.
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             super().__init__(
                 given.policy,  # type: ignore[arg-type]
@@ -115,7 +115,7 @@ class FederatedPPO(Federation, PPO):
             self._setup_model()
 
     def _check_actions(self, env: FederatedVecEnv) -> None:
-        """:raises ValueError: where this method cannot learn the environments' kind of actions"""
+        """:raises ValueError: if this method cannot learn the environments' kind of actions"""
         action_distribution(env.action_space)
         if self.uses_prior:
             instead = "use FedAvg, FedProx, FedKL, FedSVRPGM or Local"
@@ -170,8 +170,8 @@ class FederatedPPO(Federation, PPO):
     def _extra_losses(self, data: FederatedSamples, mean: th.Tensor, log_prob: th.Tensor) -> dict[str, th.Tensor]:
         """Further loss terms by name, each ``(n_clients,)`` and already weighted.
 
-        :param mean: the current policies' means, or logits of discrete actions, ``(n_clients, batch, n_outputs)``; what
-            follows from them is in ``self.policy.distribution``
+        :param mean: the current policies' means, or logits of discrete actions, ``(n_clients, batch, n_outputs)``;
+            ``self.policy.distribution`` computes densities and divergences from them
         :param log_prob: log-density of ``data.actions`` under the current policies, ``(n_clients, batch)``
         """
         return {}
@@ -223,9 +223,9 @@ class FederatedPPO(Federation, PPO):
             for index in np.flatnonzero(dones):
                 self._end_episode(int(index), infos[index])
             raw_obs, obs, starts = next_raw, self.normalizer.normalize_obs(next_raw), ends
-            if present is not None:  # a client that was away still has its episode to begin
+            if present is not None:  # an absent client has not yet begun its episode
                 starts = np.where(present[:, None], ends, rollout_buffer.episode_starts[n_steps] > 0)
-            if not goes_on or n_steps + 1 == n_rollout_steps:  # where the next rollout begins, whatever ends this one
+            if not goes_on or n_steps + 1 == n_rollout_steps:  # the next rollout begins here, for any end of this one
                 self._last_obs, self._last_episode_starts = new_obs, np.asarray(starts, dtype=bool).reshape(-1)  # type: ignore[assignment]
             if not goes_on:
                 return False
@@ -235,7 +235,7 @@ class FederatedPPO(Federation, PPO):
         return True
 
     def _exploration_noise(self, n_steps: int) -> th.Tensor:
-        """What makes the actors' outputs samples in a whole rollout, from each client's own stream.
+        """Noise that turns the actors' outputs into samples, for a whole rollout, from each client's own stream.
 
         :return: ``(n_steps, n_clients, n_envs, n_outputs)``
         """
@@ -257,7 +257,7 @@ class FederatedPPO(Federation, PPO):
 
     def _check_experience(self) -> None:
         buffer = self.rollout_buffer
-        finals = np.zeros((buffer.pos, self.n_clients), dtype=bool)  # of episodes that were cut off, and of the rollout
+        finals = np.zeros((buffer.pos, self.n_clients), dtype=bool)  # of truncated episodes, and of the rollout
         for step, client, _, final, _ in buffer.truncations:
             finals[step, client] |= not np.isfinite(final).all()
         finals[-1:] |= ~np.isfinite(self._last_obs).reshape(self.n_clients, -1).all(axis=1)  # type: ignore[arg-type]
@@ -284,7 +284,7 @@ class FederatedPPO(Federation, PPO):
         self._compute_advantages(last_values, self._truncation_values(), raw_obs, dones)
 
     def _truncation_values(self) -> np.ndarray:
-        """The critics' values of final observations of truncated episodes, in the order they happened."""
+        """The critics' values of final observations of truncated episodes, in temporal order."""
         values = np.zeros(len(self.rollout_buffer.truncations), dtype=np.float32)
         for position, (_, client, _, _, obs) in enumerate(self.rollout_buffer.truncations):
             batch = np.zeros((self.n_clients, 1, len(obs)), dtype=np.float32)

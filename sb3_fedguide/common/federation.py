@@ -1,4 +1,4 @@
-"""What every federation has, whatever its learner: clients, random streams, an offline stage, a server and rounds."""
+"""The parts of every federation, for any learner: clients, random streams, an offline stage, a server and rounds."""
 
 from __future__ import annotations
 
@@ -65,21 +65,21 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
         self.cache_dir = given.cache_dir
         self.client_fraction = given.client_fraction
         self.upload_bound = given.upload_bound
-        #: environment steps that one step of a round counts; by default those of the clients that take part here
+        #: environment steps that count for one step of a round; by default those of this process's participants
         self.steps_at_once: int | None = None
-        #: what trains the clients in other processes; here if ``None``
+        #: engine that trains the clients in other processes; ``None`` for this process
         self.engine: Engine | None = None
-        #: who takes part in the current round, ``(n_clients,)`` bool
+        #: participants of the current round, ``(n_clients,)`` bool
         self.present = np.ones(self.n_clients, dtype=bool)
-        #: who missed the last exchange and receives what the server last sent before training again
+        #: clients that missed the last exchange and receive the last broadcast before they train again
         self.outdated = np.zeros(self.n_clients, dtype=bool)
-        #: who has ever trained: a newcomer begins with all of what the server sends
+        #: clients that have trained before: a newcomer begins with the whole broadcast
         self.has_trained = np.zeros(self.n_clients, dtype=bool)
         self.round = 0
-        #: environment steps of tests (:mod:`sb3_fedguide.common.screening`), which ``num_timesteps`` leaves out
+        #: environment steps of tests (:mod:`sb3_fedguide.common.screening`); ``num_timesteps`` does not count them
         self.test_steps = 0
         self.pretrained = False
-        #: bytes that all clients together sent and received in the offline stage
+        #: bytes sent and received by all clients together in the offline stage
         self.pretraining_bytes = (0, 0)
         self.strategy: Strategy | None = None
         self._streams: dict[Role, list[np.random.Generator]] = {}
@@ -96,7 +96,7 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
 
     @property
     def partial(self) -> bool:
-        """Whether some clients may be absent from a round: what steps their parameters then counts for each by itself."""
+        """Whether some clients may be absent from a round: the optimiser then counts each client's own steps."""
         return self.client_fraction < 1.0 or (self.delays is not None and self.delays.keep_busy)
 
     def _active_steps(self, env: FederatedVecEnv) -> int:
@@ -104,14 +104,14 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
         return int(env.active.sum()) if self.steps_at_once is None else self.steps_at_once
 
     def _draw_participants(self) -> None:
-        """Draw who takes part in the coming round; the others neither step nor train, and all of their state stays."""
+        """Draw the participants of the next round; the others neither step nor train, and keep all of their state."""
         if self.n_participants == self.n_clients:
             return
         assert self.seed is not None
         self.take_part(draw_participants(self.seed, self.round, self.n_clients, self.n_participants))
 
     def take_part(self, present: np.ndarray) -> None:
-        """Let the clients ``present``, ``(n_clients,)`` bool, train in the coming round, and no others."""
+        """Let only the clients ``present``, ``(n_clients,)`` bool, train in the next round."""
         self.present = present
         env = self.get_env()
         assert isinstance(env, FederatedVecEnv)
@@ -123,7 +123,7 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
                 optimizer.make_state()
 
     def _optimizers(self) -> list[th.optim.Optimizer]:
-        """Everything that steps stacked parameters."""
+        """All optimisers of stacked parameters."""
         return [self.policy.optimizer]
 
     def present_streams(self, role: Role) -> Iterator[tuple[int, np.random.Generator]]:
@@ -149,7 +149,7 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
     ) -> SelfFederation:
         """Train for ``total_timesteps`` steps of all clients together, rounded up to whole rounds; otherwise as in SB3.
 
-        :raises ValueError: where there are no environments, as in a model that was loaded without
+        :raises ValueError: if there are no environments, as in a model that was loaded without
         """
         if self.env is None:
             raise ValueError(f"this {type(self).__name__} has no environments to train in; give it some with set_env()")
@@ -172,12 +172,12 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback, list[RoundCallback]]:
-        """What comes before the first :meth:`play_round`, after :meth:`pretrain`; arguments are those of :meth:`learn`.
+        """Prepare the first :meth:`play_round`, after :meth:`pretrain`; arguments are those of :meth:`learn`.
 
-        :return: the value of ``num_timesteps`` at which the training ends, all callbacks, and those of rounds among them
+        :return: the value of ``num_timesteps`` at which the training ends, all callbacks, and the round callbacks of them
         """
         reset = reset_num_timesteps or self._last_obs is None
-        # SB3 offers no event after train(), and off policy it knows no rounds, so the loop is our own: train, exchange, log.
+        # SB3 has no event after train(), and off policy it has no rounds, so the loop is our own: train, exchange, log.
         with in_round(1 if reset_num_timesteps else self.round + 1):
             total_timesteps, callbacks = self._setup_learn(
                 total_timesteps,
@@ -194,7 +194,7 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
         return total_timesteps, callbacks, rounds
 
     def play_round(self, callbacks: BaseCallback, rounds: list[RoundCallback], log_interval: int | None) -> bool:
-        """Train, exchange, log; false where a callback ended the training."""
+        """Train, exchange, log; false if a callback ended the training."""
         self._draw_participants()
         for hook in rounds:
             hook.on_round_start()
@@ -214,9 +214,9 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
         return all([hook.on_round_logged() for hook in rounds])
 
     def train_locally(self, callbacks: BaseCallback) -> bool:
-        """One round's training in this process; false where a callback ended it.
+        """One round's training in this process; false if a callback ended it.
 
-        :raises ClientError: where a client's environment or policy broke
+        :raises ClientError: if a client's environment or policy failed
         """
         self.normalizer.begin_round(self.present)
         try:
@@ -224,18 +224,18 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
         except BaseException as error:
             try:
                 if isinstance(error, ClientError):
-                    self._check_experience()  # what an environment returned explains an action that is not finite
+                    self._check_experience()  # non-finite values of an environment explain a non-finite action
             finally:
-                self._last_obs = None  # the environments stand in the middle of a step: the next learn() resets them
+                self._last_obs = None  # the environments are in the middle of a step: the next learn() resets them
             raise
 
     @abstractmethod
     def _check_experience(self) -> None:
-        """:raises ClientError: where an environment returned what is not finite in this round"""
+        """:raises ClientError: if an environment returned a non-finite value in this round"""
 
     @abstractmethod
     def _train_round(self, callbacks: BaseCallback) -> bool:
-        """One round's experience and gradient steps of those present; false where a callback ended the training."""
+        """One round's experience and gradient steps of the participants; false if a callback ended the training."""
 
     def _round_callbacks(self, callback: MaybeCallback, progress_bar: bool) -> CallbackList:
         """The exchange first, then the user's callbacks, which see its result, then the progress bar."""
@@ -264,7 +264,7 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
         """Actions of all clients for raw observations, ``(n_clients * batch, obs_dim)``, client-major.
 
-        :raises ValueError: where the observations cannot be divided among the clients, or come with an info
+        :raises ValueError: if the observations cannot be divided among the clients, or come with an info
         """
         if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
             raise ValueError(

@@ -1,4 +1,4 @@
-"""What Stable-Baselines3's constructors take and a federation's do not: one reason each."""
+"""Arguments of Stable-Baselines3's constructors that a federation does not support, each with its reason."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sb3_fedguide.settings.ranges import check_values
 from sb3_fedguide.settings.signatures import CompleteSignature, parameters, types_of
 
 _NO_SDE = "exploration noise is drawn by each client's own random stream, independently in every step"
-_NO_FEATURES = "lockstep policies see flat observations as they are; extract features in a wrapper around the environments"
+_NO_FEATURES = "lockstep policies see flat observations directly; extract features in a wrapper around the environments"
 _NO_BUFFER = "the clients' experience has a client axis, and its buffer is the federation's own"
 
-#: keyword of an SB3 constructor, or of its ``policy_kwargs``, to why it is not taken and what to do
+#: keyword of an SB3 constructor, or of its ``policy_kwargs``, to the reason and the remedy
 UNSUPPORTED = {
     "use_sde": _NO_SDE,
     "sde_sample_freq": _NO_SDE,
@@ -46,11 +46,11 @@ UNSUPPORTED = {
     "monitor_wrapper": "episodes are recorded by FederatedVecEnv, without a wrapper",
     "support_multi_env": "a federation always has several environments",
 }  # fmt: skip
-#: what a keyword means to an off-policy algorithm, where that is something else
+#: reasons for off-policy algorithms, if they are different
 _OFF_POLICY = {"n_steps": "the critics' targets are one-step returns, as in DDPG's paper"}
 
 
-#: what to do instead of SB3's other policies
+#: remedies for SB3's other policies
 _INSTEAD = {
     "MultiInputPolicy": "observations that are a Dict are flattened for it",
     "CnnPolicy": "images are flattened for it, and there are no convolutions",
@@ -59,7 +59,7 @@ _INSTEAD = {
 
 def check_keywords(cls: type, given: Iterable[str]) -> None:
     """:raises ValueError: for a keyword of SB3's constructor that ``cls`` does not take
-    :raises TypeError: for any other that it does not know
+    :raises TypeError: for any other unknown name
     """
     known = set(parameters(cls))
     for name in given:
@@ -88,7 +88,7 @@ def check_policy(policy: Any, aliases: Mapping[str, type[BasePolicy]], cls: type
 
 def check_policy_keywords(policy_class: type, given: Mapping[str, Any]) -> None:
     """:raises ValueError: for ``policy_kwargs`` that SB3's policies take and ``policy_class`` does not
-    :raises TypeError: for any other that it does not know
+    :raises TypeError: for any other unknown name
     """
     known = set(parameters(policy_class)) - {"observation_space", "action_space", "lr_schedule", "n_clients", "init_seed"}
     for name in given:

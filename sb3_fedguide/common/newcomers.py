@@ -1,4 +1,4 @@
-"""Clients that join late start from what a federation knows."""
+"""Clients that join late start from the mean policy of another federation."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 def start_from(model: Federation, path: str | Path) -> None:
     """Let every client of ``model`` start from the mean policy and the pooled observation statistics of another federation.
 
-    The other one's clients may be others, and of any number. It is for networks that are near each other: of a federation
-    that averages them, while it does. The offline stage of ``model`` comes first, for what the method needs beside a policy.
-    In a deployment nothing of the kind is needed: a client that comes late receives what the others have.
+    The other federation may have other clients, and any number of them. Its networks must be near each other: export
+    them while it averages them. The offline stage of ``model`` comes first, for priors and values of the method.
+    A deployment does not need this function: a client that joins late receives the others' policy.
 
     :param model: not yet trained
-    :param path: what the other federation's ``export_parameters`` wrote, such as a run's ``parameters.npz``
+    :param path: file of the other federation's ``export_parameters``, such as a run's ``parameters.npz``
     :raises ValueError: for a model that has trained, or a file that does not fit
     """
     if model.round > 0:
@@ -42,13 +42,13 @@ def start_from(model: Federation, path: str | Path) -> None:
     ]
     normalized = json.loads(str(arrays[HEADER])).get("normalize") if HEADER in arrays else None
     if wrong or not statistics or normalized != bool(model.normalize):
-        what = f"its parameter {wrong[0]} is another" if wrong else f"its normalize is {normalized}, here {model.normalize}"
+        what = f"its parameter {wrong[0]} is different" if wrong else f"its normalize is {normalized}, here {model.normalize}"
         raise ValueError(f"{path} does not fit this {type(model).__name__}: {what}; give both the same settings")
     model.pretrain()
     for index in range(model.n_clients):
         model.policy.load_client(index, {name: array.mean(axis=0).astype(np.float32) for name, array in policies.items()})
     known = zip(statistics["obs.count"].ravel(), statistics["obs.mean"], statistics["obs.var"], strict=True)
     distinct = {(mean.tobytes(), var.tobytes()): Moments(float(count), mean, var) for count, mean, var in known}
-    pooled = merge(list(distinct.values()))  # shared statistics are every client's, and count once
+    pooled = merge(list(distinct.values()))  # shared statistics are the same for all clients, and count once
     for index in range(model.n_clients):
         model.normalizer.warm_start(index, pooled.mean, pooled.var, int(pooled.count))

@@ -9,10 +9,10 @@ class OrnsteinUhlenbeckNoise:
     """One Ornstein-Uhlenbeck process around zero per client, environment and action dimension.
 
     ``x <- x - theta x dt + sigma sqrt(dt) n`` with ``n`` standard normal, as SB3's ``OrnsteinUhlenbeckActionNoise``. The
-    normal draws come from outside, so that each client's are from its own stream.
+    caller draws ``n``, so that each client has its own stream.
 
     :param shape: ``(n_clients, n_envs_per_client, action_dim)``
-    :param theta: pull towards zero
+    :param theta: rate of mean reversion
     :param sigma: scale
     :param dt: time step; the DDPG paper's process has 1, SB3's default is 0.01
     """
@@ -24,12 +24,12 @@ class OrnsteinUhlenbeckNoise:
     def __call__(self, normal: np.ndarray, present: np.ndarray | None = None) -> np.ndarray:
         """The next values, ``shape``, from standard normal draws of the same shape.
 
-        :param present: ``(n_clients,)`` bool, whose processes go on; all if ``None``
+        :param present: ``(n_clients,)`` bool, clients whose processes go on; all if ``None``
         """
         state = self.state - self.theta * self.dt * self.state + self.sigma * np.sqrt(self.dt) * normal
         self.state = state if present is None else np.where(present[:, None, None], state, self.state)
         return self.state
 
     def reset(self, ended: np.ndarray | None = None) -> None:
-        """Back to zero where an episode ended, ``(n_clients, n_envs_per_client)`` bool; everywhere by default."""
+        """Set the processes of ``ended`` episodes, ``(n_clients, n_envs_per_client)`` bool, to zero; all by default."""
         self.state[... if ended is None else ended] = 0.0

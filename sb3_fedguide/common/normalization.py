@@ -1,7 +1,7 @@
 """Running normalisation of observations and rewards: ``VecNormalize``'s semantics, with statistics per client.
 
-The statistics are private to their client, unless those of observations are shared: then each round's moments go to the
-server, and what all clients together have observed comes back. They are kept with the model and not in an environment
+The statistics are private to their client, unless those of observations are shared: then each client uploads its round's
+moments, and the server sends the moments of all clients' observations. They are part of the model, not of an environment
 wrapper, so that ``predict``, ``save`` and ``client(k)`` take raw observations, and priors and DICE values see them raw.
 """
 
@@ -30,7 +30,7 @@ class RunningMoments:
 
     def update(self, batch: np.ndarray, present: np.ndarray | None = None) -> None:
         """:param batch: ``(n_clients, n_samples, *shape)``
-        :param present: ``(n_clients,)`` bool, whose statistics to update; all if ``None``
+        :param present: ``(n_clients,)`` bool, clients to update; all if ``None``
         """
         if present is not None:
             before = {name: getattr(self, name)[~present].copy() for name in ("mean", "var", "count")}
@@ -57,10 +57,10 @@ class FederatedNormalizer:
     :param n_clients: clients in lockstep
     :param n_envs_per_client: environments of each
     :param obs_dim: observation size
-    :param gamma: discount of the running return whose deviation scales rewards
+    :param gamma: discount of the running return whose standard deviation scales rewards
     :param norm_obs: normalise observations
     :param norm_reward: normalise rewards
-    :param shared: keep the moments of each round's observations apart as well, for the server
+    :param shared: also keep the moments of each round's observations separately, for the server
     """
 
     CLIP = 10.0
@@ -85,7 +85,7 @@ class FederatedNormalizer:
 
     def update_obs(self, obs: np.ndarray, present: np.ndarray | None = None) -> None:
         """:param obs: raw, ``(n_clients, n_envs_per_client, obs_dim)``
-        :param present: ``(n_clients,)`` bool, whose statistics to update; all if ``None``
+        :param present: ``(n_clients,)`` bool, clients to update; all if ``None``
         """
         if self.norm_obs:
             self.obs.update(obs, present)
@@ -98,7 +98,7 @@ class FederatedNormalizer:
             array[present] = 0.0
 
     def round_moments(self, index: int) -> Payload:
-        """What client ``index`` uploads of its round's observations; nothing where statistics are not shared."""
+        """Client ``index``'s upload of its round's moments; empty if statistics are not shared."""
         if not self.shared:
             return {}
         moments = self.round_obs
@@ -109,7 +109,7 @@ class FederatedNormalizer:
         }
 
     def receive(self, index: int, broadcast: Payload) -> None:
-        """Take the observation statistics of all clients, where ``broadcast`` holds them."""
+        """Take the observation statistics of all clients, if ``broadcast`` holds them."""
         if OBSERVATION_COUNT in broadcast:
             self.obs.count[index] = broadcast[OBSERVATION_COUNT]
             self.obs.mean[index], self.obs.var[index] = broadcast[OBSERVATION_MEAN], broadcast[OBSERVATION_VAR]
@@ -129,9 +129,9 @@ class FederatedNormalizer:
         return np.clip(scaled, -self.CLIP, self.CLIP).astype(np.float32)
 
     def scale_reward(self, rewards: np.ndarray, dones: np.ndarray, present: np.ndarray | None = None) -> np.ndarray:
-        """Account for one step's rewards and scale them; both ``(n_clients, n_envs_per_client)``.
+        """Update the statistics by one step's rewards and scale these; both ``(n_clients, n_envs_per_client)``.
 
-        :param present: ``(n_clients,)`` bool, who took the step; all if ``None``
+        :param present: ``(n_clients,)`` bool, clients that took the step; all if ``None``
         """
         if not self.norm_reward:
             return rewards
@@ -144,7 +144,7 @@ class FederatedNormalizer:
 
     @property
     def reward_std(self) -> np.ndarray:
-        """What rewards are divided by, ``(n_clients,)``; ones where rewards are not normalised."""
+        """The divisor of rewards, ``(n_clients,)``; ones if rewards are not normalised."""
         return np.sqrt(self.ret.var + self.EPSILON) if self.norm_reward else np.ones_like(self.ret.var)
 
     def reset_returns(self, n_envs_per_client: int | None = None) -> None:
@@ -166,7 +166,7 @@ class FederatedNormalizer:
         return {name: th.as_tensor(getattr(owner, key).copy()) for name, (owner, key) in self._arrays().items()}
 
     def load_state_dict(self, state: Mapping[str, th.Tensor], strict: bool = True) -> None:
-        """:raises KeyError: where ``strict`` and an entry is missing"""
+        """:raises KeyError: if ``strict`` and an entry is missing"""
         for name, (owner, key) in self._arrays().items():
             if name == "returns" and name in state and state[name].shape != self.returns.shape:
                 continue  # loaded for another number of environments: they begin new episodes

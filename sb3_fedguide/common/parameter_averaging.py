@@ -19,27 +19,27 @@ from sb3_fedguide.state.held import Held
 
 
 class ParameterAveraging(Federation):
-    """Mixin, before its learner, for methods that average policy parameters; optimiser state stays with its client.
+    """Mixin, listed before its learner, for methods that average policy parameters; optimiser state stays with its client.
 
     :param average: ``"all"``, only the ``"actor"`` (with ``log_std``), or only the ``"critic"``
-    :param average_every: average after every so many rounds
+    :param average_every: rounds between two averages
     :param average_until: last round after which to average; ``None`` for no end
-    :param aggregator: ``"mean"``, or coordinate by coordinate the ``"median"`` or a ``"trimmed_mean"``, which a minority of
+    :param aggregator: ``"mean"``, or the coordinate-wise ``"median"`` or ``"trimmed_mean"``, which a minority of
         wrong uploads cannot move far; both ignore numbers of samples
     :param trim_fraction: share of the clients that ``"trimmed_mean"`` leaves out at either end
-    :param server_step: how far the server goes along the clients' mean update: a number (1: the average itself), or ``"exp"``
+    :param server_step: factor of the clients' mean update at the server: a number (1: the average itself), or ``"exp"``
         for FedExP's, see :func:`~sb3_fedguide.server.averaging.fedexp_step`
     :param server_momentum: share of the server's last update that is added to the next one
-    :param mix: share of what the server sends that a client takes into its own parameters: a number, or a schedule of the
-        remaining progress, bounded to [0, 1]. In a configuration ``lin_1`` falls from all to nothing over the run, and
-        ``until_0.4`` takes all for two fifths of the run and nothing after it, so that everybody ends with a policy of its own
-    :param screening: share of its environment steps that a client may spend on tests of what the server sends against its own
-        policy, see :class:`~sb3_fedguide.common.screening.Screening`; with 0 it takes it untested
+    :param mix: share of the broadcast in a client's new parameters: a number, or a schedule of the remaining progress,
+        bounded to [0, 1]. In a configuration ``lin_1`` falls from 1 to 0 over the run, and ``until_0.4`` is 1 for two fifths
+        of the run and 0 after it, so that every client ends with its own policy
+    :param screening: share of its environment steps that a client may spend on tests of the broadcast against its own
+        policy, see :class:`~sb3_fedguide.common.screening.Screening`; with 0 it takes the broadcast untested
     :param noise_multiplier: standard deviation of the Gaussian noise that each client adds to every number that it uploads, in
         units of ``clipping_norm``; 0 for none
     :param clipping_norm: L2 norm to which each client clips its update before it uploads it, see
         :class:`~sb3_fedguide.common.upload_privacy.UploadPrivacy`; ``None`` for no clipping
-    :param delta: for which the log's epsilon holds; it changes nothing else
+    :param delta: the delta of the logged epsilon; it changes nothing else
     :raises ValueError: for values out of range
 
     All other parameters are those of the learner, :class:`FederatedPPO` or :class:`FederatedDDPG`.
@@ -65,9 +65,9 @@ class ParameterAveraging(Federation):
         self.noise_multiplier = given.noise_multiplier
         self.clipping_norm = given.clipping_norm
         self.delta = given.delta
-        #: see :meth:`UploadPrivacy.begin`; empty without
+        #: see :meth:`UploadPrivacy.begin`; empty without clipping and noise
         self.privacy_state: dict[str, np.ndarray] = {}
-        #: what the server knows of what each client uploads, ``(n_clients, ...)`` each; empty without clipping
+        #: the part of each client's upload that the server knows already, ``(n_clients, ...)`` each; empty without clipping
         self.known_parameters: Parameters = {}
         self._privacy = UploadPrivacy(self)
         self._shares: dict[int, float] = {}
@@ -80,16 +80,16 @@ class ParameterAveraging(Federation):
 
     def _identity(self) -> dict[str, Any]:
         privacy = {"noise_multiplier": self.noise_multiplier or None, "clipping_norm": self.clipping_norm}
-        return {**super()._identity(), **privacy}  # what was spent is counted in these
+        return {**super()._identity(), **privacy}  # the privacy accountant counts in these
 
     def public_parameters(self) -> Parameters:
-        """What everybody knows of what each client uploads, before anything was exchanged: the policies that come of the
-        federation's seed alone. Called while they have not yet changed; ``(n_clients, ...)`` each."""
+        """The publicly known part of each client's upload before the first exchange: the initial policies, which depend
+        only on the federation's seed. Called before they change; ``(n_clients, ...)`` each."""
         return snapshot(self.policy, self.averaged_prefixes)
 
     @property
     def averaged_prefixes(self) -> tuple[str, ...]:
-        """How the names of the parameters begin that are averaged."""
+        """Prefixes of the names of averaged parameters."""
         return averaged_prefixes(self.average, self.policy.actor_prefixes, self.policy.critic_prefixes)
 
     def sends_policy(self, round: int) -> bool:
@@ -99,7 +99,7 @@ class ParameterAveraging(Federation):
         payload = super().upload(index)
         if not averaging_is_due(self.round, self.average_every, self.average_until):
             return payload
-        if self._tests.is_alone(index) or self.mix_now() == 0:  # nothing of it is to move the others
+        if self._tests.is_alone(index) or self.mix_now() == 0:  # its policy must not move the others
             return {**payload, N_SAMPLES: np.array(0, dtype=np.float32)}
         return {**payload, **self._policy_upload(index)}
 
@@ -126,7 +126,7 @@ class ParameterAveraging(Federation):
         return {**super().upload_shapes(), **policy}
 
     def _policy_upload(self, index: int) -> Payload:
-        """Copies of a client's averaged parameters under SB3's names, and the number of samples behind them."""
+        """Copies of a client's averaged parameters under SB3's names, and their number of samples."""
         payload = self.averaged_parameters(index)
         payload[N_SAMPLES] = np.array(self.rollout_size, dtype=np.float32)
         return payload
@@ -154,7 +154,7 @@ class ParameterAveraging(Federation):
 
     def take_broadcasts(self, broadcasts: Mapping[int, Payload]) -> None:
         mix = self.mix_now()
-        # who has nothing of its own, or nothing to do with what the others have, takes all or nothing
+        # a newcomer, or a client that is alone, takes the whole broadcast or nothing
         self._shares = {
             index: 1.0 if self._tests.is_alone(index) or not self.has_trained[index] else mix for index in broadcasts
         }
@@ -163,7 +163,7 @@ class ParameterAveraging(Federation):
         super().take_broadcasts(broadcasts)
 
     def _accepted(self, broadcasts: Mapping[int, Payload]) -> Mapping[int, Payload]:
-        """What is left of the broadcasts after the clients' tests."""
+        """The broadcasts that pass the clients' tests."""
         if not self.screening:
             return broadcasts
         averages = {index: self._of_policy(broadcast) for index, broadcast in broadcasts.items()}
@@ -181,7 +181,7 @@ class ParameterAveraging(Federation):
         return {name: array for name, array in broadcast.items() if name.startswith(self.averaged_prefixes)}
 
     def mixed(self, index: int, average: Payload) -> Payload:
-        """What becomes of the parameters of the client at position ``index`` where it takes its share of ``average``."""
+        """The parameters of the client at position ``index`` after it takes its share of ``average``."""
         share = self._shares.get(index, 1.0)
         if share == 1 or not average:
             return average

@@ -1,4 +1,4 @@
-"""What a federation has learned as a file of plain arrays: the form to give away, since reading it executes nothing."""
+"""A federation's learned parameters as a file of plain arrays: the format to share, since reading it executes no code."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ParameterFiles(ClientPolicies, Resumable):
     pretrained: bool
 
     def save(self, path: str | Path | io.BufferedIOBase, *args: Any, **kwargs: Any) -> None:
-        """SB3's zip archive, as in SB3. To load it is to unpickle it: give models away with :meth:`export_parameters`.
+        """SB3's zip archive, as in SB3. Loading it unpickles it: share models with :meth:`export_parameters`.
 
         A file appears complete or not at all.
         """
@@ -47,29 +47,29 @@ class ParameterFiles(ClientPolicies, Resumable):
             super().save(file, *args, **kwargs)  # type: ignore[arg-type]
 
     def export_parameters(self, path: str | Path) -> None:
-        """Write what was learned as plain arrays with a JSON header (npz, no pickle): every client's policy and
-        normalisation, and the offline stage's priors, experts and values where there are any.
+        """Write the learned parameters as plain arrays with a JSON header (npz, no pickle): every client's policy and
+        normalisation, and the offline stage's priors, experts and values, if there are any.
 
-        What only further training needs is not in it: optimisers, random streams, and the server's state.
+        It omits the state that only further training needs: optimisers, random streams, and the server's state.
         """
         _write(self, path)
 
     def import_parameters(self, path: str | Path) -> None:
-        """Take what :meth:`export_parameters` wrote, into a model made with the same settings; nothing is unpickled.
+        """Read a file of :meth:`export_parameters` into a model with the same settings; nothing is unpickled.
 
-        :raises ValueError: for a file that is damaged or of another federation, with what differs; this model stays as it is
+        :raises ValueError: for a file that is damaged or of another federation, with the differences; this model is unchanged
         """
         _read(self, path)
 
     def acting_arrays(self) -> dict[str, np.ndarray]:
-        """Copies of what decides how all clients act and the exchange may change: the policies under their parameters' names,
-        and shared observation statistics under ``normalizer/``."""
+        """Copies of the arrays that determine all clients' actions and that the exchange may change: the policies under their
+        parameters' names, and shared observation statistics under ``normalizer/``."""
         statistics = to_arrays(self.normalizer.state_dict(), "normalizer/") if self.normalizer.shared else {}
         shared = {name: array for name, array in statistics.items() if name.startswith("normalizer/obs.")}
         return {**to_arrays(self.policy.state_dict()), **shared}
 
     def set_acting_arrays(self, arrays: dict[str, np.ndarray]) -> None:
-        """Take some or all of the arrays named as in :meth:`acting_arrays`, which fit."""
+        """Take some or all of the arrays, named as in :meth:`acting_arrays`; they must fit."""
         policy = {name: array for name, array in arrays.items() if not name.startswith("normalizer/")}
         self.policy.load_state_dict({**self.policy.state_dict(), **to_tensors(policy)})
         self.normalizer.load_state_dict(to_tensors(take_prefix(arrays, "normalizer/")), strict=False)
@@ -77,7 +77,7 @@ class ParameterFiles(ClientPolicies, Resumable):
     def parameter_arrays(self, parts: Collection[str] | None = None) -> dict[str, np.ndarray]:
         """Copies of everything learned, by name.
 
-        :param parts: which of its parts, whatever is in them; those that are complete if ``None``
+        :param parts: parts to copy, complete or not; all complete ones if ``None``
         """
         policy = to_arrays(self.policy.state_dict(), "policy/")
         statistics = to_arrays(self.normalizer.state_dict(), "normalizer/")
@@ -89,12 +89,12 @@ class ParameterFiles(ClientPolicies, Resumable):
 
 
 def _exported(model: ParameterFiles) -> list[Held]:
-    """What this model's files hold beside policies and normalisation, once it has been through the offline stage."""
+    """State in this model's files beside policies and normalisation, after the offline stage."""
     return [held for held in held_by(model).values() if held.part and getattr(model, held.name, None) is not None]
 
 
 def _complete_parts(model: ParameterFiles) -> list[str]:
-    """The parts that there are at the moment."""
+    """The parts that are complete now."""
     exported = _exported(model) if model.pretrained else []
     waiting = {
         held.part
@@ -105,18 +105,18 @@ def _complete_parts(model: ParameterFiles) -> list[str]:
 
 
 def _part_differences(model: ParameterFiles, header: dict[str, Any]) -> list[str]:
-    """How the parts of a file are not those of this model with its settings."""
+    """Differences between the parts of a file and those of this model with its settings."""
     own = {held.part: held.later for held in _exported(model)} if header["pretrained"] else {}
     unknown = sorted(set(header["parts"]) - own.keys())
     missing = sorted(part for part, later in own.items() if not later and part not in header["parts"])
-    lines = [f"the file holds {', '.join(unknown)}, which this method has not with its settings"] if unknown else []
+    lines = [f"the file holds {', '.join(unknown)}, which this method does not have with its settings"] if unknown else []
     return [*lines, f"the file holds no {', '.join(missing)}, which this model with its settings needs"] if missing else lines
 
 
 def _write(model: ParameterFiles, path: str | Path) -> None:
     """Write ``model``'s parameters as one npz file: a JSON header and arrays.
 
-    :raises OSError: where it cannot be written; nothing half-written stays
+    :raises OSError: if it cannot be written; no half-written file stays
     """
     header = {
         "format": FORMAT, "version": VERSION, "algorithm": type(model).__name__, "pretrained": model.pretrained,
@@ -126,10 +126,10 @@ def _write(model: ParameterFiles, path: str | Path) -> None:
 
 
 def _read(model: ParameterFiles, path: str | Path) -> None:
-    """Take what :func:`_write` wrote; a file that does not fit leaves the model as it is.
+    """Read a file of :func:`_write`; a file that does not fit does not change the model.
 
     :raises ValueError: for a file that is absent, damaged, pickled, of another version, or of another federation; the
-        message says what differs
+        message names the differences
     """
     header, arrays = _open(path)
     differences = [
@@ -171,7 +171,7 @@ def read_policies(path: str | Path, replaced: dict[str, np.ndarray] | None = Non
     policies = take_prefix(arrays, "policy/")
     if "spaces" not in header:
         raise ValueError(
-            f"{path} is of an earlier version, which wrote no spaces; load it into a model of the same settings with "
+            f"{path} is of an earlier version, without spaces; load it into a model of the same settings with "
             "import_parameters(), and export_parameters() again"
         )
     try:
@@ -197,7 +197,7 @@ def read_policies(path: str | Path, replaced: dict[str, np.ndarray] | None = Non
 
 
 def _identity(model: ParameterFiles) -> dict[str, Any]:
-    """What decides, beside the arrays, which actions a policy takes."""
+    """Settings that, beside the arrays, determine a policy's actions."""
     policy, space = model.policy, model.action_space
     actions: dict[str, Any] = {"action_space": describe_space(space)}
     if isinstance(space, spaces.Box):  # bounds are text, since one may be infinite
@@ -212,7 +212,7 @@ def _identity(model: ParameterFiles) -> dict[str, Any]:
 
 
 def _outside(model: ParameterFiles) -> dict[str, Any]:
-    """What a policy needs beside the arrays where there is no federation, see :func:`read_policies`."""
+    """Settings that a policy needs beside the arrays without a federation, see :func:`read_policies`."""
     settings = {name: _plain(value) for name, value in client_settings(model).items()}
     return {
         "learner": model.learner,
@@ -225,7 +225,7 @@ def _outside(model: ParameterFiles) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A number of JSON, also for a schedule that is constant; anything else as it is."""
+    """A JSON number, also for a constant schedule; other values unchanged."""
     if isinstance(value, FloatSchedule) and isinstance(value.value_schedule, ConstantSchedule):
         value = value.value_schedule.val
     return value.item() if isinstance(value, np.generic) else value
@@ -253,7 +253,7 @@ def _read_header(array: np.ndarray | None, path: str | Path) -> dict[str, Any]:
     except (ValueError, RecursionError):
         header = None
     if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ValueError(f"{path} holds no parameters of a federation: its header is missing or another one")
+        raise ValueError(f"{path} holds no parameters of a federation: its header is missing or different")
     if header.get("version") != VERSION:
         raise ValueError(f"{path} has version {header.get('version')!r} of the format; this program reads version {VERSION}")
     parts, pretrained = header.get("parts"), header.get("pretrained")

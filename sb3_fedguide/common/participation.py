@@ -1,4 +1,4 @@
-"""Partial participation: an optimiser that leaves those untouched who do not take part in a round."""
+"""Partial participation: an optimiser that does not change clients that are absent from a round."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ __all__ = ["ParticipationAdam", "draw_participants", "n_participants", "simulate
 
 
 def simulate_delays(model: Federation, settings: DelaySettings) -> None:
-    """Let the clients' rounds take simulated time, before the model is trained or loads parameters.
+    """Let the clients' rounds take simulated time; call it before the model is trained or loads parameters.
 
-    Who is busy neither trains nor receives; ``num_timesteps`` counts every round as if nobody were, so that the number of
-    rounds stays what it is without delays.
+    A busy client neither trains nor receives. ``num_timesteps`` counts every round as if no client were busy, so that the
+    number of rounds is the same as without delays.
 
     :raises ValueError: for a model that has trained, or has been through its offline stage
     """
     if model.pretrained or model.round > 0:
-        raise ValueError("delays have to be there from the beginning: call simulate_delays() on a new model")
+        raise ValueError("delays must begin before training: call simulate_delays() on a new model")
     assert model.seed is not None
     model.delays = Delays(settings, model.seed, model.client_ids)
     model.steps_at_once = model.n_participants * model.n_envs_per_client
     if model.delays.keep_busy:
-        model._setup_model()  # with an optimiser that leaves the busy alone
+        model._setup_model()  # with an optimiser that skips busy clients
 
 
 class ParticipationAdam(th.optim.Optimizer):
-    """Adam on stacked parameters that steps some clients only: each counts its own steps, and the absent keep all state.
+    """Adam on stacked parameters that steps only some clients: each counts its own steps, and absent clients keep all state.
 
     ``torch.optim.Adam`` moves on zero gradients and has one step count for all clients. With all present the two are equal.
 
@@ -54,11 +54,11 @@ class ParticipationAdam(th.optim.Optimizer):
         eps: float = 1e-8,
     ) -> None:
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
-        #: ``(n_clients,)`` bool: who steps; all if ``None``
+        #: ``(n_clients,)`` bool: clients that step; all if ``None``
         self.present: np.ndarray | None = None
 
     def make_state(self) -> None:
-        """Moments and step counts, zero, of the parameters that have none yet."""
+        """Make zero moments and step counts for the parameters that have none yet."""
         for group in self.param_groups:
             for parameter in group["params"]:
                 state = self.state[parameter]

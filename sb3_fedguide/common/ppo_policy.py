@@ -45,7 +45,7 @@ class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
     :param net_arch: as in SB3; actor and critic may differ, ``dict(pi=[64, 64], vf=[64, 64])``
     :param activation_fn: activation module class
     :param log_std_init: initial value of the state-independent log standard deviation, of continuous actions
-    :raises ValueError: for other than flat ``Box`` observations, and actions that
+    :raises ValueError: for observations that are not a flat ``Box``, and actions that
         :func:`~sb3_fedguide.common.distributions.action_distribution` refuses
     """
 
@@ -99,20 +99,20 @@ class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def _build_mlp_extractor(self) -> None:
-        # On the CPU first, so that one seed gives one initial network on every device.
+        # On the CPU first, so that one seed gives the same initial network on every device.
         self.mlp_extractor = MlpExtractor(
             self.features_dim, net_arch=self.net_arch, activation_fn=self.activation_fn, device="cpu"
         )
 
     def actor_mean(self, obs: th.Tensor) -> th.Tensor:
-        """What the distribution of actions is made of, for observations ``(n_clients, batch, obs_dim)``.
+        """Parameters of the distribution of actions, for observations ``(n_clients, batch, obs_dim)``.
 
         :return: a Gaussian's mean, or logits, ``(n_clients, batch, n_outputs)``
         """
         return self.action_net(self.mlp_extractor.policy_net(obs))
 
     def fixed_actor_mean(self) -> Callable[[th.Tensor], th.Tensor]:
-        """:meth:`actor_mean` with the present weights, without gradients: for a rollout, which calls it at every step."""
+        """:meth:`actor_mean` with the current weights, without gradients: for a rollout, which calls it at every step."""
         return fixed_forward([self.mlp_extractor.policy_net, self.action_net])
 
     def values(self, obs: th.Tensor) -> th.Tensor:
@@ -120,7 +120,7 @@ class StackedMlpPolicy(StackedPolicy, ActorCriticPolicy):
         return self.value_net(self.mlp_extractor.value_net(obs)).squeeze(-1)
 
     def actor(self) -> StackedActor:
-        """A copy of the actors by themselves, for behaviour cloning."""
+        """A copy of the actors alone, for behaviour cloning."""
         return StackedActor(copy.deepcopy(self.mlp_extractor.policy_net), copy.deepcopy(self.action_net))
 
     def actor_parameter(self, name: str) -> nn.Parameter:

@@ -1,4 +1,4 @@
-"""What clients' noised uploads have spent: Opacus' accountant, for uploads instead of gradients."""
+"""The privacy spent by clients' noised uploads: Opacus' accountant, for uploads instead of gradients."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import numpy as np
 
 #: Renyi orders at which the accountant looks, dense enough to be within a tenth of the exact epsilon.
 ORDERS = (1 + np.geomspace(1e-4, 1e4, 800)).tolist()
-#: Two clipped updates differ by at most twice the norm that they are clipped to.
+#: Two clipped updates differ by at most twice their clipping norm.
 SENSITIVITY = 2.0
 
 
 def check_accountant() -> None:
-    """:raises ValueError: where Opacus is not installed"""
+    """:raises ValueError: if Opacus is not installed"""
     if importlib.util.find_spec("opacus") is None:
-        raise ValueError("noise_multiplier needs Opacus, which says what epsilon is: pip install 'sb3-fedguide[privacy]'")
+        raise ValueError("noise_multiplier needs Opacus, which computes epsilon: pip install 'sb3-fedguide[privacy]'")
 
 
 @functools.lru_cache(maxsize=1000)
 def epsilon(noise_multiplier: float, n_uploads: int, delta: float) -> float:
     """Epsilon of ``n_uploads`` uploads of one client, at ``delta``.
 
-    With probability ``1 - delta`` what the client uploaded is no more than ``exp(epsilon)`` times as likely as it would be had
-    the client had any other data: local differential privacy of the client as a whole. Its uploads are Gaussian mechanisms of
-    L2 sensitivity ``2 * clipping_norm``, composed in Renyi differential privacy. Nothing is taken off for rounds in which a
-    client was not drawn: the server knows who uploads.
+    With probability ``1 - delta``, the client's uploads are at most ``exp(epsilon)`` times as likely as with any other data
+    of the client: local differential privacy of the whole client. Its uploads are Gaussian mechanisms of
+    L2 sensitivity ``2 * clipping_norm``, composed in Renyi differential privacy. Client sampling gives no discount: the
+    server knows who uploads.
 
     :param noise_multiplier: standard deviation of the noise in units of ``clipping_norm``
     :return: infinite without noise

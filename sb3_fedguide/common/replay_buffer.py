@@ -32,16 +32,16 @@ class FederatedReplaySamples(NamedTuple):
 
 
 class FederatedReplayBuffer(ReplayBuffer):
-    """One ring of transitions per client; a client samples its own only, by its own stream.
+    """One ring of transitions per client; a client samples only its own, by its own random stream.
 
-    Observations and rewards are stored raw and normalised when they are sampled, as SB3 does with ``VecNormalize``. An
-    episode cut off by a time limit is no termination: its last transition bootstraps from the final observation.
+    Observations and rewards are stored raw and normalised when they are sampled, as SB3 does with ``VecNormalize``. The
+    end of a truncated episode is not a termination: its last transition bootstraps from the final observation.
 
     :param buffer_size: transitions per client
     :param observation_space: flat ``Box``, like ``action_space``
     :param n_clients: clients in lockstep
     :param n_envs_per_client: transitions that every client adds at a time
-    :param device: where samples go
+    :param device: of the samples
     """
 
     def __init__(
@@ -56,10 +56,10 @@ class FederatedReplayBuffer(ReplayBuffer):
         # Not ReplayBuffer's constructor: its arrays have no client axis, and its capacity is divided among environments.
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_clients * n_envs_per_client)
         self.n_clients, self.n_envs_per_client = n_clients, n_envs_per_client
-        #: whose transitions these are, in the order of the arrays
+        #: owners of the transitions, in the order of the arrays
         self.client_ids = list(range(n_clients))
         self.optimize_memory_usage, self.handle_timeout_termination = False, True
-        #: transitions that each client holds, and where its next one goes, ``(n_clients,)``
+        #: each client's number of transitions, and the position of its next one, ``(n_clients,)``
         self.sizes, self.positions = np.zeros(n_clients, dtype=int), np.zeros(n_clients, dtype=int)
         rows = (buffer_size, n_clients)
         self.observations = np.zeros((*rows, *observation_space.shape), dtype=np.float32)
@@ -79,7 +79,7 @@ class FederatedReplayBuffer(ReplayBuffer):
     ) -> None:
         """Store one step of all environments; every array is ``(n_clients, n_envs_per_client, ...)``.
 
-        :param present: ``(n_clients,)`` bool, who took the step; all if ``None``
+        :param present: ``(n_clients,)`` bool, clients that took the step; all if ``None``
         """
         clients = np.arange(self.n_clients) if present is None else np.flatnonzero(present)
         for copy in range(self.n_envs_per_client):
@@ -101,7 +101,7 @@ class FederatedReplayBuffer(ReplayBuffer):
         self.sizes[:], self.positions[:] = 0, 0
 
     def save_state(self) -> State:
-        """The transitions that there are, and where the next ones go."""
+        """The stored transitions, and the positions of the next ones."""
         transitions = [
             {name: getattr(self, name)[:size, client].copy() for name in _ARRAYS} for client, size in enumerate(self.sizes)
         ]
@@ -110,7 +110,7 @@ class FederatedReplayBuffer(ReplayBuffer):
     def load_state(self, state: State) -> None:
         """Take the transitions of :meth:`save_state`.
 
-        :raises ValueError: where they do not fit, such as those of a larger buffer
+        :raises ValueError: if they do not fit, such as those of a larger buffer
         """
         for client, transitions in enumerate(state["transitions"]):
             for name in _ARRAYS:
@@ -125,8 +125,8 @@ class FederatedReplayBuffer(ReplayBuffer):
     ) -> FederatedReplaySamples:
         """Transitions drawn with replacement, ``batch_size`` per client.
 
-        :param streams: position and generator of each client that samples; what the others get is arbitrary
-        :param normalizer: with the statistics of now, not of when the transitions were stored
+        :param streams: position and generator of each client that samples; the samples of the others are arbitrary
+        :param normalizer: normalises with its current statistics, not with those at the time of storing
         """
         index = np.zeros((self.n_clients, batch_size), dtype=int)
         for position, rng in streams:

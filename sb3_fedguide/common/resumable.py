@@ -1,4 +1,4 @@
-"""All that a federation remembers between two rounds, as plain data: what a checkpoint is made of."""
+"""The whole state of a federation between two rounds, as plain data: the content of a checkpoint."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ SelfResumable = TypeVar("SelfResumable", bound="Resumable")
 
 
 class Resumable(BaseAlgorithm):
-    """Mixin of a federation that gives and takes its state between two rounds.
+    """Mixin of a federation that saves and loads its state between two rounds.
 
-    A new object with the same settings that takes the state goes on bit for bit like the one that gave it. What an
-    algorithm adds to the state is named in its own ``state_attributes``, and nowhere else.
+    A new object with the same settings that loads the state goes on bit for bit like the object that saved it. An
+    algorithm's additions to the state are named only in its own ``state_attributes``.
     """
 
-    #: attributes that change while it trains, by name or as :class:`Held`; those of the base classes are added
+    #: attributes that change during training, by name or as :class:`Held`; those of the base classes are added
     state_attributes: ClassVar[tuple[str | Held, ...]] = (
         "seed", "num_timesteps", "round", "_n_updates", "_episode_num", "_current_progress_remaining", "pretrained",
         "pretraining_bytes", "present", "outdated", "has_trained", "test_steps", "episode_infos", "_streams", "_last_obs",
@@ -50,15 +50,15 @@ class Resumable(BaseAlgorithm):
     n_envs_per_client: int
     rollout_size: int
     family: Any
-    #: of the run that is resumed, until its callbacks are there
+    #: of the resumed run, until its callbacks exist
     _callback_states: Sequence[State] = ()
 
     @abstractmethod
     def _optimizers(self) -> list[th.optim.Optimizer]:
-        """Everything that steps parameters."""
+        """All optimisers."""
 
     def _identity(self) -> dict[str, Any]:
-        """What has to be the same where a state is taken."""
+        """Settings that must be the same in the model that loads a state."""
         return {
             "algorithm": type(self).__name__,
             "family": None if self.family is None else self.family.content_hash,
@@ -68,10 +68,10 @@ class Resumable(BaseAlgorithm):
         }
 
     def _setup_state(self) -> None:
-        """Begin to hold what a new model of this method holds, in its shapes: the last of what ``_setup_model()`` does."""
+        """Set the initial state of a new model, in its final shapes: the last step of ``_setup_model()``."""
 
     def hold(self, **values: Any) -> None:
-        """Begin to hold ``values``, by attribute, unless they came with a saved model: for :meth:`_setup_state`."""
+        """Set the attributes ``values`` unless they came with a saved model: for :meth:`_setup_state`."""
         for name, value in values.items():
             if getattr(self, name, None) is None:
                 setattr(self, name, value)
@@ -79,7 +79,7 @@ class Resumable(BaseAlgorithm):
     def save_state(self) -> State:
         """Policies, optimisers, server, normalisation, random streams, environments and counters; only between two rounds.
 
-        :raises ValueError: where something cannot be part of it, with the remedy
+        :raises ValueError: if something cannot be part of it, with the remedy
         """
         state: State = {
             "identity": self._identity(),
@@ -102,7 +102,7 @@ class Resumable(BaseAlgorithm):
         return state
 
     def load_state(self, state: State) -> None:
-        """Take what :meth:`save_state` returned; ``learn(remaining_timesteps, reset_num_timesteps=False)`` then goes on.
+        """Load a state of :meth:`save_state`; ``learn(remaining_timesteps, reset_num_timesteps=False)`` then goes on.
 
         :raises ValueError: for the state of another algorithm, other clients or other sizes
         """
@@ -124,9 +124,9 @@ class Resumable(BaseAlgorithm):
         np.random.set_state(thaw(state["random"]["numpy"]))
 
     def begin_lost_episodes(self) -> list[int]:
-        """Begin new episodes where :meth:`load_state` found environments that cannot be put back to where they stood.
+        """Begin new episodes in environments whose state :meth:`load_state` could not restore.
 
-        :return: the clients that lost an episode by it
+        :return: the clients that lost an episode
         """
         rows, observations, clients = self._federated_env().begin_lost_episodes()
         if len(rows):
@@ -136,10 +136,10 @@ class Resumable(BaseAlgorithm):
         return clients
 
     def resume(self: SelfResumable, folder: str | Path) -> SelfResumable:
-        """Take the newest intact checkpoint that a :class:`CheckpointCallback` wrote to ``folder``.
+        """Load the newest intact checkpoint of a :class:`CheckpointCallback` in ``folder``.
 
         The next ``learn(remaining_timesteps, callbacks, reset_num_timesteps=False)`` goes on from there, with callbacks of
-        the same kinds as in the run that wrote it.
+        the same classes as in the run that wrote it.
 
         :raises ValueError: if there is none, none is intact, or it does not fit
         """
@@ -155,9 +155,9 @@ class Resumable(BaseAlgorithm):
         return self
 
     def _resume_callbacks(self, callbacks: Iterable[RoundCallback]) -> None:
-        """Hand the callbacks of a resumed run their part of the checkpoint, by class and order.
+        """Give the callbacks of a resumed run their part of the checkpoint, by class and order.
 
-        :raises CheckpointError: where one is missing, or its part does not fit
+        :raises CheckpointError: if one is missing, or its part does not fit
         """
         waiting = list(self._callback_states)
         for callback in callbacks:
@@ -171,8 +171,8 @@ class Resumable(BaseAlgorithm):
         self._callback_states = ()
         if waiting:
             raise CheckpointError(
-                "the checkpoint holds the state of callbacks that this run has not got: "
-                f"{', '.join(saved['class'] for saved in waiting)}; give learn() the callbacks of the run that is resumed"
+                "the checkpoint holds the state of callbacks that this run does not have: "
+                f"{', '.join(saved['class'] for saved in waiting)}; give learn() the callbacks of the resumed run"
             )
 
     def _federated_env(self) -> FederatedVecEnv:
@@ -185,7 +185,7 @@ class Resumable(BaseAlgorithm):
         return [*super()._excluded_save_params(), "_callback_states"]
 
     def _forgotten(self, saved: Collection[str]) -> list[str]:
-        """Attributes with arrays that are neither saved nor said to be transient."""
+        """Attributes with arrays that are neither saved nor declared as transient."""
         transient = set(self._excluded_save_params())
         return [
             name for name, value in vars(self).items() if name not in saved and name not in transient and _holds_arrays(value)

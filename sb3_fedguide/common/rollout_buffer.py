@@ -25,7 +25,7 @@ class FederatedSamples(NamedTuple):
 
 
 def check_sizes(rollout_size: int, batch_size: int, n_envs_per_client: int) -> None:
-    """:raises ValueError: for sizes of a client's rollout that do not fit together"""
+    """:raises ValueError: if sizes of a client's rollout do not fit together"""
     check_copies(rollout_size, n_envs_per_client)
     if not 1 < batch_size <= rollout_size:
         raise ValueError(f"batch_size={batch_size} must lie between 2 and rollout_size={rollout_size}; both are per client")
@@ -64,8 +64,8 @@ def generalized_advantage(
 class FederatedRolloutBuffer:
     """One round's rollout of all clients.
 
-    Arrays are ``(n_steps, n_clients, n_envs_per_client, ...)`` while it is collected. A client's rows are numbered
-    ``env * n_steps + step``, as ``stable_baselines3.RolloutBuffer`` flattens them.
+    Arrays are ``(n_steps, n_clients, n_envs_per_client, ...)`` while it is collected. A client's rows have the numbers
+    ``env * n_steps + step``, as in the flattened ``stable_baselines3.RolloutBuffer``.
 
     :param n_steps: steps per environment
     :param action_dim: entries of an action
@@ -110,7 +110,7 @@ class FederatedRolloutBuffer:
         rewards: np.ndarray,
         episode_starts: np.ndarray,
     ) -> None:
-        """Append one step, arrays ``(n_clients, n_envs_per_client, ...)``; values and log-probabilities follow in bulk."""
+        """Append one step, arrays ``(n_clients, n_envs_per_client, ...)``; values and log-probabilities are added later."""
         pos = self.pos
         self.raw_observations[pos] = raw_obs
         self.observations[pos] = obs
@@ -120,7 +120,7 @@ class FederatedRolloutBuffer:
         self.pos += 1
 
     def add_truncation(self, client: int, env: int, raw_obs: np.ndarray, obs: np.ndarray) -> None:
-        """Remember the final observation of an episode that the time limit ended at the step added last."""
+        """Store the final observation of an episode that was truncated in the last added step."""
         self.truncations.append((self.pos - 1, client, env, raw_obs, obs))
 
     def rows(self, array: np.ndarray) -> np.ndarray:
@@ -133,7 +133,7 @@ class FederatedRolloutBuffer:
         return np.moveaxis(split, 2, 0)
 
     def bootstrapped_rewards(self, gamma: float, truncation_values: np.ndarray) -> np.ndarray:
-        """Rewards plus ``gamma * V`` of the final observation where the time limit ended an episode.
+        """Rewards plus, for truncated episodes, ``gamma * V`` of the final observation.
 
         :param truncation_values: the baseline at the final observations, in the order they were added
         """
@@ -147,7 +147,7 @@ class FederatedRolloutBuffer:
     ) -> Iterator[FederatedSamples]:
         """One epoch of minibatches.
 
-        :param rngs: position and generator of each client that trains: its rows' order; the others' rows stay in theirs
+        :param rngs: position and generator of each client that trains, to shuffle its rows; the others' rows keep their order
         """
         rows = np.tile(np.arange(self.n_rows), (self.n_clients, 1))
         for index, rng in rngs:

@@ -1,4 +1,4 @@
-"""Tests of what the server sends in the client's own environments: who takes it, and who goes on alone."""
+"""Tests of the broadcast in the client's own environments: each client accepts it, or goes on alone."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ if TYPE_CHECKING:
     from fed_envs import FederatedVecEnv
     from sb3_fedguide.common.parameter_averaging import ParameterAveraging
 
-#: Episodes of either policy in a test, where there are steps for so many.
+#: Episodes of either policy in a test, if there are enough steps left.
 EPISODES = 5
-#: How much better a policy has to test, in what the client's returns measure.
+#: Margin by which a policy must be better in a test, relative to the scale of the client's returns.
 MARGIN = 0.1
-#: The first test comes after this round; between two tests lie at most so many.
+#: Round of the first test; largest number of rounds between two tests.
 FIRST_ROUND, LONGEST_WAIT = 1, 16
-#: Part of the steps that are left for tests which one test may take.
+#: Largest share of the remaining test steps for one test.
 PART = 0.25
 
 
 class Screening:
-    """Each client's tests, and what it concludes from them.
+    """Each client's tests, and its decisions from them.
 
-    A client takes what the server sends until that tests clearly worse than the policy that the client has just trained. Then
-    it goes on alone: it uploads nothing that counts, and what the server sends is left to the others, until it tests clearly
-    better than the client's own. A test is some episodes of both policies, deterministic and with the same seeds, in copies
-    of the client's environments. A test that changes nothing doubles the rounds until the next one.
+    A client takes the broadcast until a test shows that it is clearly worse than the policy that the client has just trained.
+    Then the client goes on alone: its uploads have no weight, and it does not take the broadcast, until a test shows that the
+    broadcast is clearly better than its own policy. A test is some episodes of both policies, deterministic and with the same
+    seeds, in copies of the client's environments. A test that changes nothing doubles the rounds until the next one.
 
-    Their steps are environment steps: ``Federation.test_steps`` counts them.
+    Tests cost environment steps: ``Federation.test_steps`` counts them.
 
     The idea is that of POET's transfer (Wang et al. 2019) and of screening in CAESAR (Mak et al. 2024).
     """
@@ -44,10 +44,10 @@ class Screening:
         self._env: FederatedVecEnv | None = None
 
     def begin(self) -> None:
-        """Lay out ``screening_state``, unless it was loaded.
+        """Make ``screening_state``, unless it was loaded.
 
-        Per client, ``(n_clients,)``: whether it is alone, the steps of its tests (and of those without simulated time yet),
-        the round of its next one, and the rounds that it then waits."""
+        Per client, ``(n_clients,)``: whether it is alone, the steps of its tests (and those not yet in simulated time),
+        the round of its next test, and the rounds to wait after that."""
         state, n_clients = self.model.screening_state, self.model.n_clients
         if self.model.screening and not state:
             state["alone"] = np.zeros(n_clients, dtype=bool)
@@ -57,13 +57,13 @@ class Screening:
             state["wait"] = np.ones(n_clients, dtype=int)
 
     def is_alone(self, index: int) -> bool:
-        """Whether the client at position ``index`` has left what the others share."""
+        """Whether the client at position ``index`` has left the average."""
         return bool(self.model.screening > 0 and self.model.screening_state["alone"][index])
 
     def refused(self, candidates: Mapping[int, Payload]) -> set[int]:
-        """The clients that do not take what they were sent, after the tests that are due.
+        """The clients that refuse the broadcast, after the tests that are due.
 
-        :param candidates: by position, the parameters that a client would then have
+        :param candidates: by position, a client's parameters if it accepts
         """
         model, state = self.model, self.model.screening_state
         episodes = {index: self._affordable(index) for index in candidates}
@@ -83,7 +83,7 @@ class Screening:
         return {index for index in candidates if state["alone"][index]}
 
     def _affordable(self, index: int) -> int:
-        """Episodes of either policy for which the client has steps left; 0 for none."""
+        """Episodes of either policy that the client can afford with its remaining steps; 0 for none."""
         model, state = self.model, self.model.screening_state
         lengths = [info["l"] for info in model.episode_infos[index]]
         if not lengths or not model.has_trained[index]:
@@ -93,8 +93,8 @@ class Screening:
         return 0 if left < pair else max(1, min(EPISODES, int(PART * left / pair)))
 
     def _scale(self, index: int, own: np.ndarray) -> float:
-        """What differences between returns are measured in: the level of the client's own, or how far its returns in training
-        lie apart where that is more."""
+        """The unit of differences between returns: the level of the client's own returns, or the spread of its training
+        returns if that is larger."""
         returns = [info["r"] for info in self.model.episode_infos[index]]
         return max(abs(float(own.mean())), float(np.std(returns)))
 
@@ -137,6 +137,6 @@ def clearly_better(returns: np.ndarray, others: np.ndarray, margin: float) -> bo
 
 
 def check_screening(screening: float, average: str) -> None:
-    """:raises ValueError: where no policy is sent that could be tested"""
+    """:raises ValueError: if the server sends no policy to test"""
     if screening > 0 and average == "critic":
         raise ValueError("screening tests policies, and average='critic' sends none; use 'all' or 'actor', or screening=0")

@@ -1,4 +1,4 @@
-"""Observation and action spaces as plain data, and which of them Stable-Baselines3 takes as they are."""
+"""Observation and action spaces as plain data, and a check whether Stable-Baselines3 takes them unflattened."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gymnasium import spaces
 def describe_space(space: spaces.Space) -> dict[str, Any]:
     """A space as JSON; the inverse of :func:`space_from`.
 
-    :raises ValueError: for a kind of space that no policy is made for
+    :raises ValueError: for a kind of space that no policy supports
     """
     if isinstance(space, spaces.Box):
         bounds = {name: _bound(getattr(space, name)) for name in ("low", "high")}
@@ -48,15 +48,15 @@ def space_from(description: Any) -> spaces.Space:
         if kind == "Dict":
             parts = {name: space_from(part) for name, part in description["spaces"].items()}
             return spaces.Dict(list(parts.items()))  # a list keeps its order, a mapping is sorted
-    except Exception as error:  # what may be wrong with somebody's JSON has no end
+    except Exception as error:  # foreign JSON may be wrong in any way
         raise ValueError(f"it describes no space: {error}") from None
     raise ValueError(f"it describes no space: the type is {kind!r}")
 
 
 def is_plain(space: spaces.Space) -> bool:
-    """Whether SB3's policies see in an observation what ``gymnasium.spaces.flatten`` makes of it.
+    """Whether SB3's policies see an observation in the same form as ``gymnasium.spaces.flatten``.
 
-    It is so for arrays, numbers of a choice that are counted from 0, and a Dict of these.
+    This holds for arrays, discrete values that are counted from 0, and a Dict of these.
     """
     if isinstance(space, spaces.Dict):
         return all(is_plain(part) and not isinstance(part, spaces.Dict) for part in space.spaces.values())
@@ -66,7 +66,7 @@ def is_plain(space: spaces.Space) -> bool:
 
 
 def _bound(array: np.ndarray) -> list[str]:
-    """As text, since a bound may be infinite; one entry where all are the same."""
+    """As text, since a bound may be infinite; one entry if all are the same."""
     values = [str(value) for value in array.ravel().tolist()]
     return values[:1] if len(set(values)) == 1 else values
 

@@ -1,4 +1,4 @@
-"""What the clients' stacked policies share, whatever SB3 policy they stand on."""
+"""The common part of the clients' stacked policies, for any SB3 policy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sb3_fedguide.state.stacked import client_state, stack_module
 class StackedPolicy(BasePolicy):
     """Mixin for policies whose parameters have a leading client dimension and otherwise SB3's names."""
 
-    #: how the names of the actor's and the critic's parameters begin
+    #: prefixes of the names of the actor's and the critic's parameters
     actor_prefixes: ClassVar[tuple[str, ...]]
     critic_prefixes: ClassVar[tuple[str, ...]]
     n_clients: int
@@ -27,9 +27,9 @@ class StackedPolicy(BasePolicy):
     def split_clients(self, obs: th.Tensor) -> th.Tensor:
         """``(n_clients * batch, obs_dim)``, client-major, to ``(n_clients, batch, obs_dim)``.
 
-        :raises ValueError: where the rows cannot be divided among the clients
+        :raises ValueError: if the rows cannot be divided among the clients
         """
-        obs = obs.float()  # as SB3's policies, which take numbers of any kind
+        obs = obs.float()  # as SB3's policies, which take any numeric type
         if obs.dim() == 3 and obs.shape[0] == self.n_clients:
             return obs
         if obs.shape[0] % self.n_clients:
@@ -57,7 +57,7 @@ class StackedPolicy(BasePolicy):
 
 
 def check_observations(space: spaces.Space) -> None:
-    """:raises ValueError: for other than flat ``Box`` observations"""
+    """:raises ValueError: for observations that are not a flat ``Box``"""
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise ValueError(
             f"a federation's policy needs one-dimensional Box observations, but the observation space is {space}; flatten it "

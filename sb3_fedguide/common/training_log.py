@@ -1,4 +1,4 @@
-"""What one round's ``train()`` reports."""
+"""The log of one round's ``train()``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class RoundStatistics:
 
 
 def record_training(model: FederatedPPO, statistics: RoundStatistics, schedules: dict[str, Schedule | None]) -> None:
-    """SB3's ``train/`` keys as averages over clients, and the telling ones for each client."""
+    """SB3's ``train/`` keys as averages over clients, and the most informative ones for each client."""
     buffer = model.rollout_buffer
     means = statistics.means()
     values, returns = buffer.rows(buffer.values), buffer.rows(buffer.returns)

@@ -1,4 +1,4 @@
-"""Differential privacy of what a client uploads: its change is clipped and gets noise before it leaves the client."""
+"""Differential privacy of uploads: a client clips its update and adds noise before it uploads it."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 
 
 class UploadPrivacy:
-    """Each client's clipping and noise, and what it has spent.
+    """Each client's clipping and noise, and its spent privacy.
 
-    With ``d`` the difference of all that a client uploads to what the server knows of it already, ``d`` as one vector, it
-    uploads
+    ``known`` is the part of a client's upload that the server knows already, and ``d`` the difference of the upload to it, as
+    one vector. The client uploads
 
     ``known + d * min(1, clipping_norm / |d|) + N(0, (noise_multiplier * clipping_norm)^2)``.
 
-    The server knows what it last sent to the client, and before that the policy that the federation's seed gives everybody.
-    The client adds the noise, so that neither the server nor who reads the transport ever sees an update without it. It
-    follows from the update and the client's key alone (:func:`gaussian_noise`): a run that goes on from a checkpoint uploads
-    the same again, and no two updates ever get the same noise. In one process the key comes of the federation's seed; a client
-    on its own machine draws one that nobody else knows. A client that has left what the others share (``screening``) uploads a
+    The server knows its last broadcast to the client, and before that the initial policy from the federation's seed.
+    The client adds the noise, so that neither the server nor a reader of the transport ever sees an update without it. The
+    noise depends only on the update and the client's key (:func:`gaussian_noise`): a run resumed from a checkpoint uploads
+    the same again, and no two updates ever get the same noise. In one process the key comes from the federation's seed; a
+    client on its own machine draws a key that nobody else knows. A client that has left the average (``screening``) uploads a
     difference of zero, with noise: nobody sees that it has left.
 
-    The idea is that of McMahan et al. (2018), with the noise at the client and not at the server.
+    The idea is that of McMahan et al. (2018), with the noise at the client instead of the server.
     """
 
     def __init__(self, model: ParameterAveraging) -> None:
@@ -48,14 +48,14 @@ class UploadPrivacy:
         return self.model.noise_multiplier > 0
 
     def begin(self) -> None:
-        """Check that clipping and noise reach all that is uploaded, and lay out ``privacy_state``, unless it was loaded.
+        """Check that clipping and noise cover the whole upload, and make ``privacy_state``, unless it was loaded.
 
-        It holds for each client, ``(n_clients,)``: uploads so far that were clipped or got noise (``uploads``), and of them
+        It holds for each client, ``(n_clients,)``: the number of uploads with clipping or noise (``uploads``), and of them
         those that were longer than ``clipping_norm`` (``clipped``); the round of the last one (``round``), and the norm of its
         update (``norm``); and the noise's ``key``, ``(n_clients, 8)``, uint32.
 
-        :raises ValueError: for noise without a norm that it is measured by or without the accountant, and where something
-            would leave the client that is not protected
+        :raises ValueError: for noise without a clipping norm or without the accountant, and if anything unprotected would
+            leave the client
         """
         model = self.model
         if self.has_noise:
@@ -97,21 +97,21 @@ class UploadPrivacy:
             )
 
     def draw_secret_keys(self) -> None:
-        """Forget the keys that whoever knows the federation's seed knows."""
+        """Replace the keys that come from the federation's seed by secret ones."""
         keys = self.model.privacy_state["key"]
         keys[:] = np.frombuffer(secrets.token_bytes(keys.nbytes), dtype=np.uint32).reshape(keys.shape)
 
     def receive(self, broadcasts: Mapping[int, Payload]) -> None:
-        """Note what the server knows, by the client's position."""
+        """Remember the broadcasts, which the server knows, by the client's position."""
         known = self.model.known_parameters
         for index, broadcast in broadcasts.items():
             for name in broadcast.keys() & known.keys():
                 known[name][index] = broadcast[name]
 
     def protect(self, index: int, payload: Payload) -> Payload:
-        """What the client at position ``index`` sends instead of ``payload``.
+        """The upload of the client at position ``index`` instead of ``payload``.
 
-        :raises ValueError: for an array of which it is not known what the server knows of it
+        :raises ValueError: for an array without a part that the server knows already
         """
         model = self.model
         if self.has_noise and N_SAMPLES not in payload:  # nothing is averaged now
@@ -126,14 +126,14 @@ class UploadPrivacy:
             raise ValueError(f"noise_multiplier and clipping_norm do not protect {', '.join(unprotected)}, which it uploads")
         n_samples = payload[N_SAMPLES]
         if not n_samples:
-            if model.mix_now() == 0:  # as for everybody
+            if model.mix_now() == 0:  # as for all clients
                 return {N_SAMPLES: n_samples}
             values, n_samples = known, np.array(model.rollout_size, dtype=np.float32)
         others = {name: payload[name] for name in apart}
         return {**others, **self._privatized(index, values, known), N_SAMPLES: n_samples}
 
     def _privatized(self, index: int, values: Payload, known: Payload) -> Payload:
-        """The arrays ``values`` with their difference to ``known`` clipped and with noise."""
+        """The arrays ``values``, with clipping of their difference to ``known``, and with noise."""
         model, state = self.model, self.model.privacy_state
         assert model.clipping_norm is not None
         names = sorted(values)
@@ -155,9 +155,9 @@ class UploadPrivacy:
         return {name: part.astype(np.float32).reshape(np.shape(values[name])) for name, part in parts}
 
     def metrics(self, public: bool) -> dict[str, float]:
-        """This round's uploads, by log key; nothing where there were none.
+        """Metrics of this round's uploads, by log key; empty if there were none.
 
-        :param public: only what tells nothing of the updates
+        :param public: only metrics that reveal nothing about the updates
         """
         model, state = self.model, self.model.privacy_state
         norms = state["norm"][state["round"] == model.round]
@@ -173,7 +173,7 @@ class UploadPrivacy:
         return metrics
 
     def summary(self) -> dict[str, Any]:
-        """What was spent in the whole run, for its last page; epsilon is that of the client which uploaded most."""
+        """The privacy spent in the whole run, for its summary; epsilon is that of the client with the most uploads."""
         model, state = self.model, self.model.privacy_state
         uploads = state["uploads"]
         summary = {
@@ -188,20 +188,20 @@ class UploadPrivacy:
 
 
 def clipping_factor(norm: float, clipping_norm: float) -> float:
-    """By what an update of L2 norm ``norm`` is multiplied; exactly one where it is not longer than ``clipping_norm``.
+    """The factor of an update of L2 norm ``norm``; exactly one if it is not longer than ``clipping_norm``.
 
-    Of a norm that is no number it is none either, so that nothing of such an update is uploaded.
+    For a norm of NaN it is NaN too, so that nothing of such an update is uploaded.
     """
     return 1.0 if norm <= clipping_norm else clipping_norm / norm
 
 
 def gaussian_noise(key: bytes, content: bytes, size: int) -> np.ndarray:
-    """``size`` standard normal numbers, float64, that nobody can tell from random ones without the key.
+    """``size`` standard normal numbers, float64, which look random to anybody without the key.
 
     SHAKE-256 of key and content, by the method of Box and Muller.
 
     :param key: of fixed length
-    :param content: what the noise is for: others get independent numbers
+    :param content: the update that gets the noise; different contents get independent numbers
     """
     n_pairs = -(-size // 2)
     bits = np.frombuffer(hashlib.shake_256(key + content).digest(16 * n_pairs), dtype="<u8")

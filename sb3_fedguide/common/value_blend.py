@@ -1,4 +1,4 @@
-"""How good a baseline is, and the best blend of two (paper, Lemma 2)."""
+"""Quality of a baseline, and the best blend of two (paper, Lemma 2)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ def explained_variances(values: np.ndarray, returns: np.ndarray) -> np.ndarray:
     """``1 - Var(returns - values) / Var(returns)`` per client.
 
     :param values: ``(n_clients, n_rows)``, like ``returns``
-    :return: ``(n_clients,)``; NaN where returns do not vary
+    :return: ``(n_clients,)``; NaN if returns do not vary
     """
     variance = returns.var(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -17,7 +17,7 @@ def explained_variances(values: np.ndarray, returns: np.ndarray) -> np.ndarray:
 
 
 def advantage_variances(returns: np.ndarray, baseline: np.ndarray) -> np.ndarray:
-    """``Var(G - V)`` of each client: of the advantage whose baseline is ``V`` (paper, Lemma 2).
+    """``Var(G - V)`` of each client: the variance of the advantage with baseline ``V`` (paper, Lemma 2).
 
     :param returns: Monte Carlo returns G, ``(n_clients, n_rows)``, like ``baseline``
     :return: ``(n_clients,)``
@@ -28,10 +28,10 @@ def advantage_variances(returns: np.ndarray, baseline: np.ndarray) -> np.ndarray
 def residual_correlations(returns: np.ndarray, online: np.ndarray, dice: np.ndarray) -> np.ndarray:
     """``kappa_i = Corr(G - V_theta, V_phi - V_theta)`` (paper, Lemma 2).
 
-    At beta* the advantage's variance is ``Var(G - V_theta) (1 - kappa_i^2)``: what V_phi can take away at most.
+    At beta* the advantage's variance is ``Var(G - V_theta) (1 - kappa_i^2)``: the largest reduction that V_phi allows.
 
     :param returns: Monte Carlo returns G, ``(n_clients, n_rows)``, like the values ``online`` and ``dice``
-    :return: ``(n_clients,)``; 0 where one of the two does not vary
+    :return: ``(n_clients,)``; 0 if one of the two does not vary
     """
     residual, correction = _centred_difference(returns, online), _centred_difference(dice, online)
     scale = np.sqrt((residual**2).mean(axis=1) * (correction**2).mean(axis=1))
@@ -39,7 +39,7 @@ def residual_correlations(returns: np.ndarray, online: np.ndarray, dice: np.ndar
 
 
 def _centred_difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """``first - second`` less its mean over rows; zero where it varies by no more than single precision's rounding."""
+    """``first - second`` minus its mean over rows; zero if it varies only by single precision's rounding."""
     difference = first.astype(np.float64) - second
     difference -= difference.mean(axis=1, keepdims=True)
     rounding = 1e-6 * np.maximum(np.abs(first).max(axis=1), np.abs(second).max(axis=1))
@@ -52,7 +52,7 @@ def optimal_blend(returns: np.ndarray, online: np.ndarray, dice: np.ndarray) -> 
     With ``d = V_phi - V_theta``: ``beta* = 1 - Cov(G - V_theta, d) / Var(d)``, clipped to [0, 1].
 
     :param returns: Monte Carlo returns G, ``(n_clients, n_rows)``, like the values ``online`` and ``dice``
-    :return: ``(n_clients,)``; 1 where the two values differ by a constant
+    :return: ``(n_clients,)``; 1 if the two values differ by a constant
     """
     difference = (dice - online).astype(np.float64)
     difference -= difference.mean(axis=1, keepdims=True)
@@ -65,7 +65,7 @@ def optimal_blend(returns: np.ndarray, online: np.ndarray, dice: np.ndarray) -> 
 
 
 def baseline_metrics(returns: np.ndarray, online: np.ndarray, dice: np.ndarray, blend: np.ndarray) -> dict[str, np.ndarray]:
-    """How much of the returns each baseline explains, and the quantities of the paper's Lemma 2, ``(n_clients,)`` each.
+    """Explained variance of each baseline, and the quantities of the paper's Lemma 2, ``(n_clients,)`` each.
 
     :param returns: Monte Carlo returns G, ``(n_clients, n_rows)``, like the three baselines
     """

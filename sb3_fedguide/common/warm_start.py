@@ -1,4 +1,4 @@
-"""What a federation does before its first round, whatever its learner: the offline stage."""
+"""The offline stage of a federation before its first round, for any learner."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class WarmStart(BaseAlgorithm):
-    """Mixin of a federation: behaviour cloning, and what a method adds to it with :meth:`_pretrain`."""
+    """Mixin of a federation: behaviour cloning, and a method's own part in :meth:`_pretrain`."""
 
     #: whether the offline stage has priors, whose trunk all clients train together
     uses_prior: ClassVar[bool] = False
@@ -58,7 +58,7 @@ class WarmStart(BaseAlgorithm):
         )
 
     def check_offline_data(self) -> None:
-        """:raises ValueError: where the offline stage needs data and none can be had, before anything is computed"""
+        """:raises ValueError: if the offline stage needs data that are not available, before anything is computed"""
         if self.pretrained or not (self.uses_prior or self.bc_weight > 0):
             return
         try:
@@ -68,12 +68,12 @@ class WarmStart(BaseAlgorithm):
             raise ValueError(f"{type(self).__name__} begins with an offline stage: {error}{remedy}") from None
 
     def pretrain(self, progress_bar: bool = False, trunk: Payload | None = None, progress: Progress | None = None) -> None:
-        """The offline stage: behaviour cloning and whatever the method needs; results are cached. Runs at most once.
+        """The offline stage: behaviour cloning and the method's own part; results are cached. Runs at most once.
 
-        :param trunk: the priors' trunk where a server has trained it
+        :param trunk: the priors' trunk if a server has trained it
             (:meth:`sb3_fedguide.server.trunk.TrunkAverages.payload`); otherwise it is trained here, on all clients' data
-        :param progress: called as the stage goes on, instead of a bar for each piece
-        :raises ValueError: where the method needs offline data and none can be had
+        :param progress: called during the stage, instead of a bar for each piece
+        :raises ValueError: if the method needs offline data that are not available
         """
         if self.pretrained:
             return
@@ -85,15 +85,15 @@ class WarmStart(BaseAlgorithm):
         self.pretrained = True
 
     def _actors(self) -> nn.Module:
-        """A copy of the stacked actors by themselves: observations to actions in the action space's own units."""
+        """A copy of the stacked actors alone: observations to actions in the action space's own units."""
         assert isinstance(self.policy, StackedMlpPolicy)
         return self.policy.actor()
 
     def _initialize_from_behavior_cloning(self, stage: Pretraining) -> None:
         """theta_0 = (1 - alpha) theta_rand + alpha theta_BC, both from the same initial actor.
 
-        With running normalisation, each client's observation statistics start from its own offline data, in whose scale
-        the actor was cloned.
+        With running normalisation, each client's observation statistics start from its own offline data, because the actor
+        was cloned in their scale.
         """
         if self.normalize:
             for index, data in enumerate(stage.datasets()):

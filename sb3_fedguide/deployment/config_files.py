@@ -1,4 +1,4 @@
-"""The configuration files of a deployment: what a server and a client are told, checked before anything starts."""
+"""The configuration files of a deployment's server and clients, checked before anything starts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ServerFile(_File):
     """The server's configuration file.
 
     :param algo: command-line name of the method
-    :param env: whose entry of the settings to take, as for the clients; no environment is made here
+    :param env: family whose settings to take, as for the clients; no environment is made here
     :param conf: settings, as for ``-conf``
     :param params: hyperparameters to overwrite, as for the clients; the server takes those that concern it
     :param n_rounds: communication rounds, by default those of the settings
@@ -38,12 +38,12 @@ class ServerFile(_File):
     :param clients: public key of each client by its number, or the file that holds it
     :param timeout: seconds that a client may take for a round
     :param setup_timeout: seconds that a client may take for each step of the offline stage
-    :param start_clients: clients that are awaited before anything begins; by default all
-    :param min_clients: replies without which a round does not end
-    :param wait: seconds to wait for too few clients before the server gives up; null: for ever
+    :param start_clients: number of clients to wait for before anything begins; by default all
+    :param min_clients: smallest number of replies with which a round ends
+    :param wait: seconds to wait for missing clients before the server gives up; null: for ever
     :param listen: address and port on which clients reach the server
-    :param certificates: folder that ``fedguide deploy certificates`` wrote
-    :param folder: where the server keeps what it knows
+    :param certificates: folder of ``fedguide deploy certificates``
+    :param folder: folder of the server's state
     """
 
     algo: str
@@ -69,7 +69,7 @@ class ClientFile(_File):
     :param server: ``host:port`` of the server
     :param ca: the federation's ``ca.crt``
     :param key: this client's private key
-    :param folder: where the client keeps its state
+    :param folder: folder of the client's state
     """
 
     server: str
@@ -112,12 +112,12 @@ class ServerDeployment:
             raise ValueError(f"{path}: one of the settings has the wrong type: {error}") from None
 
     def process_settings(self) -> dict[str, Any]:
-        """What the process of the round loop reads."""
+        """Settings for the process of the round loop."""
         return {"server": asdict(self.server), "clients": self.clients, "folder": str(self.folder)}
 
 
 class ClientDeployment:
-    """A client's file, checked but for its site, with absolute paths.
+    """A client's file, checked except for its site, with absolute paths.
 
     :raises ValueError: for anything that a user can put right
     """
@@ -141,19 +141,19 @@ class ClientDeployment:
         self.site = given
 
     def process_settings(self) -> dict[str, Any]:
-        """What the process that answers a message reads."""
+        """Settings for the process that answers a message."""
         return {"site": self.site, "folder": str(self.folder)}
 
 
 def _conf(conf: str, base: Path) -> str:
-    """A configuration's name as it is, a path as seen from the file that gives it."""
+    """A configuration's name unchanged, or a path relative to the file that gives it."""
     return conf if conf in CONFIGURATIONS else str(base / conf)
 
 
 def _settings(file: ServerFile, base: Path) -> dict[str, Any]:
-    """What the clients' settings are made of. They are checked, but for an algorithm whose class would be needed for that.
+    """The settings for the clients. They are checked, except if that would need an algorithm's class.
 
-    :raises ValueError: for what is wrong
+    :raises ValueError: for a wrong setting
     """
     check_names([file.algo], ALGORITHMS, "algorithm")
     own = ALGORITHMS[file.algo].arguments is None
@@ -194,12 +194,12 @@ def _address(text: str, path: Path, name: str) -> tuple[str, int]:
         if not host or not 1 <= int(port) <= 65535:
             raise ValueError
     except ValueError:
-        raise ValueError(f"{path}: {name}: {text!r} is no address such as fed.example.org:9443") from None
+        raise ValueError(f"{path}: {name}: {text!r} is not an address such as fed.example.org:9443") from None
     return host, int(port)
 
 
 def _key_text(text: str, base: Path, path: Path) -> str:
-    """A public key that stands in the configuration, or in the file that it names."""
+    """A public key from the configuration, or from the file that it names."""
     if not text.startswith("ecdsa-"):
         _check_file(base / text, "give a client's public key, or the file that holds it")
         text = (base / text).read_text(encoding="utf-8", errors="replace")

@@ -122,7 +122,7 @@ def parse_delays(text: str) -> DelaySettings:
     for item in rest.split(",") if rest else []:
         name, equals, number = item.partition("=")
         if not equals or name in values:
-            raise ValueError(f"{item!r} is not NAME=NUMBER" if not equals else f"{name} stands twice")
+            raise ValueError(f"{item!r} is not NAME=NUMBER" if not equals else f"{name} is given twice")
         try:
             values[name] = float(number)
         except ValueError:

@@ -1,4 +1,4 @@
-"""Every method's strategy from its settings alone: what a model in process and a server without PyTorch both call."""
+"""Every method's strategy from its settings alone, for a model in process and for a server without PyTorch."""
 
 from __future__ import annotations
 
@@ -32,10 +32,9 @@ Settings = Mapping[str, Any]
 #: Makes a strategy from complete settings, the number of clients and the federation's seed.
 Maker = Callable[[Settings, int, int], Strategy | None]
 
-#: What every server has to know.
+#: Settings of every server.
 COMMON = ("client_fraction", "upload_bound", "normalize")
-#: What the server of an averaging method has to know. What clients do to their uploads is its business as far as all have to
-#: do the same.
+#: Settings of an averaging method's server. Clipping and noise of uploads are included: all clients must have the same.
 OF_AVERAGING = ("average_every", "average_until", "aggregator", "trim_fraction", "server_step", "server_momentum")
 AVERAGING = ("average", *OF_AVERAGING, "noise_multiplier", "clipping_norm")
 EXPERTISE = ("n_experts", "eta", "cost", "cost_scaling")
@@ -46,9 +45,9 @@ class Method:
     """The server's side of a method.
 
     :param make: see :data:`Maker`
-    :param defaults: its settings beside :data:`COMMON`, under the names that the model's constructor has for them
-    :param arguments: what the model's constructor takes, for the ranges of these settings; a setting that it does not have is
-        checked as the argument of that name of the algorithms that are here
+    :param defaults: its settings beside :data:`COMMON`, under their names in the model's constructor
+    :param arguments: the dataclass of the model's constructor, for the ranges of these settings
+        Settings that it does not have are checked as the arguments of the shipped algorithms with the same name
     """
 
     make: Maker
@@ -57,7 +56,7 @@ class Method:
 
     @classmethod
     def of(cls, make: Maker, arguments: type, names: Sequence[str]) -> Method:
-        """One whose settings are those ``names`` of ``arguments``, with the defaults that they have there."""
+        """A method with the settings ``names`` of ``arguments``, with their defaults there."""
         return cls(make, {name: getattr(arguments, name) for name in names}, arguments)
 
 
@@ -80,7 +79,7 @@ def _experts_and_parameters(settings: Settings, n_clients: int, seed: int) -> St
     return Composite([_experts(settings, n_clients, seed), averaging])
 
 
-#: The methods' servers; :data:`sb3_fedguide.registry.ALGORITHMS` says whose is which.
+#: The methods' servers; :data:`sb3_fedguide.registry.ALGORITHMS` assigns them.
 NOTHING = Method(lambda settings, n_clients, seed: None, {})
 PPO_AVERAGING = Method.of(_averaging(Averaging, PPO_ACTOR, PPO_CRITIC), FedAvgArguments, AVERAGING)
 PPO_AVERAGING_BEYOND = Method.of(PPO_AVERAGING.make, FedGuideRArguments, AVERAGING)
@@ -93,7 +92,7 @@ EXPERTS_AND_PARAMETERS = Method.of(_experts_and_parameters, FedGuideAArguments, 
 def find_method(name: str) -> Method:
     """The server's side of an algorithm, by its command-line name.
 
-    Of an algorithm of one's own that is registered without one, its base class's; this imports the class and PyTorch.
+    For a user's own algorithm that is registered without a server, that of its base class; this imports the class and PyTorch.
 
     :raises ValueError: for an unknown algorithm, or one whose class makes its strategy itself
     """
@@ -104,7 +103,7 @@ def find_method(name: str) -> Method:
 
 
 def method_of(cls: type) -> Method:
-    """The server's side of the nearest base of a class that is registered with one; of others, nothing is exchanged."""
+    """The server's side of the nearest base of a class that is registered with one; without one, nothing is exchanged."""
     servers = (ALGORITHMS[name].server for name in registered_names(cls))
     return next((_load(server) for server in servers if server is not None), NOTHING)
 
@@ -128,7 +127,7 @@ def _types_by_name() -> Mapping[str, Any]:
 
 
 def complete_settings(algorithm: str | Method, given: Settings) -> dict[str, Any]:
-    """All settings of a method's server, those not given by their defaults.
+    """All settings of a method's server, with defaults for those that are not given.
 
     :raises ValueError: for a setting that the server does not have, and an unknown ``normalize``
     """
@@ -139,12 +138,12 @@ def complete_settings(algorithm: str | Method, given: Settings) -> dict[str, Any
         raise ValueError(f"the server {whose}has no setting {unknown[0]!r}; it has {', '.join(sorted(settings))}")
     complete = {**settings, **given}
     check_normalize(complete["normalize"])
-    complete["normalize"] = "shared" if complete["normalize"] == "shared" else False  # what stays with clients is no matter
+    complete["normalize"] = "shared" if complete["normalize"] == "shared" else False  # the server does not use the others
     return complete
 
 
 def make_strategy(algorithm: str | Method, settings: Settings, n_clients: int, seed: int) -> Strategy | None:
-    """The strategy of an algorithm; ``None`` where nothing is exchanged.
+    """The strategy of an algorithm; ``None`` if nothing is exchanged.
 
     :param algorithm: command-line name, or the method itself
     :param settings: hyperparameters that the server needs, under the names of the constructor's parameters

@@ -1,8 +1,8 @@
-"""What the algorithms' constructors take: name, type with its range, and default of every argument, here and nowhere else.
+"""Arguments of the algorithms' constructors: name, type with its range, and default of each, only here.
 
 The constructors take these classes (:func:`~sb3_fedguide.settings.signatures.takes`); the command line, servers and the
-documentation read them, without PyTorch and pydantic. Types that need these are strings, each one name of
-:mod:`sb3_fedguide.settings.argument_types`. What an argument does stands in the docstring of its algorithm.
+documentation read them, without PyTorch and pydantic. Types that need these are strings, each a name in
+:mod:`sb3_fedguide.settings.argument_types`. The docstring of its algorithm describes an argument.
 """
 
 # Without `from __future__ import annotations`: types are objects, with their ranges.
@@ -16,13 +16,13 @@ from sb3_fedguide.settings.ranges import OPEN, Range
 if TYPE_CHECKING:
     from sb3_fedguide.settings.argument_types import DeviceLike, MaybeFederation, MaybePretraining, PolicyLike
 
-#: A value for every remaining progress, from 1 down to 0, as in SB3.
+#: A function of the remaining progress, from 1 down to 0, as in SB3.
 Schedule = Callable[[float], float]
-#: What the server averages: everything, the actor with ``log_std``, or the critic.
+#: Parameters that the server averages: all, the actor with ``log_std``, or the critic.
 Average = Literal["all", "actor", "critic"]
 #: Ways to combine uploads, see :func:`sb3_fedguide.server.averaging.combine`.
 Aggregator = Literal["mean", "median", "trimmed_mean"]
-#: Nothing, statistics per client, or observation statistics that all clients share.
+#: No normalisation, statistics per client, or observation statistics that all clients share.
 Normalize = bool | Literal["shared"]
 TransportCost = Literal["score", "param"]
 CostScaling = Literal["max", "median"]
@@ -30,7 +30,7 @@ CostScaling = Literal["max", "median"]
 #: Default bound on norms: at 10 an honest client of FedAvg on Bandit2D was rejected (six times the median of four).
 UPLOAD_BOUND = 30.0
 
-# Sizes end far above what is useful and below what no memory holds.
+# Upper bounds of sizes are far above useful values and below those that exceed any memory.
 Count = Annotated[int, Range(1)]
 Size = Annotated[int, Range(1, 1e7)]
 Copies = Annotated[int, Range(1, 1000)]
@@ -38,16 +38,16 @@ Positive = Annotated[float, Range(OPEN)]
 NotNegative = Annotated[float, Range(0)]
 Share = Annotated[float, Range(0, 1)]
 ServerStep = Annotated[float | Literal["exp"], Range(OPEN, why="1 is the average itself, and 'exp' FedExP's step")]
-Mix = Annotated[float, Range(0, 1, "it is the share of what the server sends that a client takes", start=100)]
+Mix = Annotated[float, Range(0, 1, "it is the share of the broadcast that a client takes", start=100)]
 Tested = Annotated[float, Range(0, 0.5)]
 Rounds = Annotated[int, Range(1, 1e7)]
 
 
 @dataclass(frozen=True)
 class FederationArguments:
-    """Those of every federation."""
+    """Arguments of every federation."""
 
-    #: names of the policies, and in :mod:`sb3_fedguide.settings.networks` what their ``policy_kwargs`` are
+    #: names of the policies; :mod:`sb3_fedguide.settings.networks` has their ``policy_kwargs``
     policies: ClassVar[tuple[str, ...]] = ("MlpPolicy",)
     network_config: ClassVar[str]
 
@@ -75,7 +75,7 @@ class FederationArguments:
     _init_setup_model: bool = True
 
     def of(self, base: type) -> dict[str, Any]:
-        """Those that the class ``base`` has as well, as keywords."""
+        """The arguments that the class ``base`` has too, as keywords."""
         return {field.name: getattr(self, field.name) for field in fields(base)}
 
 

@@ -24,19 +24,19 @@ if TYPE_CHECKING:
     from sb3_fedguide.common.federated_ddpg import FederatedDDPG
     from sb3_fedguide.common.federated_ppo import FederatedPPO
 
-#: Name of a configuration to the folder inside ``zoo_configs`` that holds it.
+#: Name of a configuration to its folder inside ``zoo_configs``.
 CONFIGURATIONS = {"tuned": ".", "paper": "paper", "quick": "."}
-#: The file of ``zoo_configs`` whose entries go over every method's own, by configuration.
+#: Configuration to the file of ``zoo_configs`` whose entries override every method's own.
 OVERLAYS = {"quick": "quick.yml"}
 
-#: Families whose settings a user's own family on the same backbone starts from.
+#: Families whose settings a user's own family on the same backbone takes.
 BACKBONE_FAMILIES = {
     "Bandit2D": "Bandit2D", "Reacher-v5": "Reacher", "Hopper-v5": "Hopper", "Walker2d-v5": "Walker2D",
     "HalfCheetah-v5": "HalfCheetah", "MetaWorld-v3": "MetaWorld10", "PointMaze-v3": "PointMaze",
 }  # fmt: skip
 
 DEFAULT = "default"
-#: Far more than any configuration needs: bytes of a file, and what its aliases may expand to.
+#: Limits far above any configuration's needs: bytes of a file, and the extent of its expanded aliases.
 MAX_BYTES, MAX_NODES, MAX_DEPTH = 1_000_000, 20_000, 20
 NESTED = ("pretraining", "policy_kwargs")
 _SET_ELSEWHERE = {"gamma": "the DICE value takes the algorithm's own gamma"}
@@ -49,7 +49,7 @@ class _Loader(yaml.SafeLoader):
         names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.value != "<<"]
         for name in names:
             if names.count(name) > 1:
-                raise yaml.YAMLError(f"the key {name!r} stands twice in one mapping, line {node.start_mark.line + 1}")
+                raise yaml.YAMLError(f"the key {name!r} is given twice in one mapping, line {node.start_mark.line + 1}")
         return super().construct_mapping(node, deep)
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
@@ -85,9 +85,9 @@ class Config:
     def make(self, env: Any, **arguments: Any) -> FederatedPPO | FederatedDDPG:
         """Construct the algorithm.
 
-        :param env: whatever a federation can be made of
-        :param arguments: constructor arguments that are no hyperparameters, such as ``seed``
-        :raises ValueError: where the values do not fit together
+        :param env: as for the algorithm's constructor
+        :param arguments: constructor arguments that are not hyperparameters, such as ``seed``
+        :raises ValueError: if the values do not fit together
         """
         values = {name: schema.schedule_or_value(value) for name, value in self.values.items() if name != "n_rounds"}
         network = network_config(self.algo).model_validate(values.pop("policy_kwargs"))
@@ -114,7 +114,7 @@ def resolve(
     """The hyperparameters of a run.
 
     :param algo: command-line name of an algorithm
-    :param family: whom to train
+    :param family: clients to train
     :param conf_file: ``"tuned"``, ``"paper"``, ``"quick"`` (tuned, but small and short), or the path of a YAML file
     :param entry: name of the family whose settings to take; by default the family's own, or that of its backbone
     :param overrides: from ``-params`` and flags; nested ones by dotted keys
@@ -138,9 +138,9 @@ def resolve(
 def layers(
     algo: str, conf_file: str, names: Sequence[str], overrides: Mapping[str, Any], check: bool = True
 ) -> tuple[Path, str, dict[str, Any]]:
-    """What a configuration, what goes over it, and ``overrides`` say together; values are not yet checked.
+    """Values of a configuration, its overlay and ``overrides`` together; not yet checked.
 
-    :param names: of entries, of which the first that the configuration has applies
+    :param names: of entries; the first one in the configuration applies
     :param overrides: nested ones by dotted keys
     :param check: refuse unknown hyperparameters in files, and name the file
     :return: the file, the entry that applied beyond ``default``, and the values
@@ -153,7 +153,7 @@ def layers(
 
 
 def _entries(path: Path, names: Sequence[str], algo: str, check: bool) -> tuple[str, dict[str, Any]]:
-    """The first of the entries ``names`` that a file has, and what it says over the file's ``default``."""
+    """The first of the entries ``names`` in a file, and its values over the file's ``default``."""
     content = read_config(path)
     applied = next((name for name in names if name in content), DEFAULT)
     merged: dict[str, Any] = {}
@@ -221,7 +221,7 @@ def _config_folder() -> Path:
 
 
 def _inherited_path(folder: Path, algo: str) -> Path:
-    """An algorithm of the user's own has no file here; it takes the settings of the nearest class that has one."""
+    """A user's own algorithm has no file here; it takes the settings of the nearest class with a file."""
     cls = algorithm(algo)
     for name in (*registered_names(cls), cls.base_settings):
         if name is not None and (path := folder / f"{name}.yml").is_file():
@@ -232,7 +232,7 @@ def _inherited_path(folder: Path, algo: str) -> Path:
 def read_config(path: Path) -> dict[str, dict[str, Any]]:
     """A configuration file: a mapping of families (and ``default``) to hyperparameters.
 
-    :raises ValueError: if it cannot be read or is something else
+    :raises ValueError: if it cannot be read or is not a configuration
     """
     content = read_yaml(path)
     if not isinstance(content, dict) or not all(isinstance(entry, dict) for entry in content.values()):
@@ -246,7 +246,7 @@ def read_config(path: Path) -> dict[str, dict[str, Any]]:
 def read_yaml(path: Path) -> Any:
     """A YAML file as plain data.
 
-    :raises ValueError: if it cannot be read, is no YAML, or is more than a configuration can be
+    :raises ValueError: if it cannot be read, is not YAML, or is too large for a configuration
     """
     try:
         with path.open("rb") as file:
@@ -254,7 +254,7 @@ def read_yaml(path: Path) -> Any:
     except OSError as error:
         raise ValueError(f"cannot read the configuration {path}: {error.strerror}") from None
     if len(text) > MAX_BYTES:
-        raise ValueError(f"{path} is no configuration: it has more than {MAX_BYTES} bytes")
+        raise ValueError(f"{path} is not a configuration: it has more than {MAX_BYTES} bytes")
     return _parse_yaml(text, str(path))
 
 
@@ -264,13 +264,13 @@ def _parse_yaml(text: str | bytes, source: str) -> Any:
         _check_extent(value)
     except RecursionError:
         raise ValueError(f"{source} is not valid YAML: it is nested too deeply") from None
-    except Exception as error:  # int(), float() and datetime inside the loader raise what they like
+    except Exception as error:  # int(), float() and datetime inside the loader raise various errors
         raise ValueError(f"{source} is not valid YAML: {' '.join(str(error).split()) or type(error).__name__}") from None
     return value
 
 
 def _check_extent(value: Any) -> None:
-    """Refuse what a few lines with aliases can expand to.
+    """Refuse aliases that expand to too much data.
 
     :raises yaml.YAMLError: for data that are too many or nested too deeply
     """
@@ -287,9 +287,9 @@ def _check_extent(value: Any) -> None:
 
 
 def parse_params(pairs: Sequence[str], flag: str = "-params") -> dict[str, Any]:
-    """``key:value`` pairs of ``-params`` or another flag; values are YAML scalars or lists, and nothing is evaluated.
+    """``key:value`` pairs of ``-params`` or another flag; values are YAML scalars or lists, and no code is executed.
 
-    :raises ValueError: for a pair without a key or value, a key that is given twice, or a value that is no YAML
+    :raises ValueError: for a pair without a key or value, a key that is given twice, or a value that is not YAML
     """
     values: dict[str, Any] = {}
     for pair in pairs:
@@ -310,9 +310,9 @@ def _policy_type(algo: str) -> Any:
 
 
 def network_config(algo: str) -> type[NetworkConfig]:
-    """What an algorithm's ``policy_kwargs`` are; one of the user's own may say it in its class, as ``network_config``.
+    """The type of an algorithm's ``policy_kwargs``; a user's own class may have it as ``network_config``.
 
-    :raises ValueError: where that is no :class:`~sb3_fedguide.settings.networks.NetworkConfig`
+    :raises ValueError: if that is not a :class:`~sb3_fedguide.settings.networks.NetworkConfig`
     """
     if ALGORITHMS[algo].arguments is None and (own := getattr(algorithm(algo), "network_config", None)) is not None:
         if not isinstance(own, type) or not issubclass(own, NetworkConfig):

@@ -1,12 +1,12 @@
-"""When a run evaluates its policies. Imports nothing heavy."""
+"""The rounds in which a run evaluates its policies. Imports nothing heavy."""
 
 from __future__ import annotations
 
-#: Rounds between evaluations, where nothing else is said.
+#: Rounds between evaluations, by default.
 EVAL_FREQ = 5
-#: Episodes per client of an evaluation, where nothing else is said.
+#: Episodes per client of an evaluation, by default.
 EVAL_EPISODES = 10
-#: So many rounds at the end of a run are all evaluated, and CV is taken over them.
+#: Number of rounds at the end of a run that are all evaluated; CV is computed over them.
 LAST_ROUNDS = 20
 
 

@@ -1,4 +1,4 @@
-"""Names given by a user against those that exist."""
+"""Checks of a user's names against the known ones."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ Layers = Annotated[list[Annotated[int, pydantic.Field(gt=0, le=8192)]], pydantic
 
 
 class NetworkConfig(pydantic.BaseModel):
-    """What the networks of stochastic and of deterministic policies have in common."""
+    """Common settings of the networks of stochastic and of deterministic policies."""
 
     model_config = pydantic.ConfigDict(extra="forbid", strict=True)
 

@@ -1,4 +1,4 @@
-"""Modules of the user's own, which register environments and algorithms."""
+"""The user's own modules, which register environments and algorithms."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ def import_packages(modules: Sequence[str]) -> None:
     for module in modules:
         try:
             importlib.import_module(module)
-        except Exception as error:  # whatever the user's module raises while it is imported
+        except Exception as error:  # any error of the user's module
             raise ValueError(f"--gym-packages {module}: {type(error).__name__}: {error}") from None

@@ -10,17 +10,17 @@ from pydantic import BaseModel, ConfigDict, Field
 __all__ = ["DEFAULTS", "Count", "Piece", "PretrainingConfig", "prior_is_gaussian"]
 
 Count = Annotated[int, Field(ge=1, lt=2**31)]
-Size = Annotated[int, Field(ge=1, le=10_000_000)]  # far above what is useful, and below what no memory holds
+Size = Annotated[int, Field(ge=1, le=10_000_000)]  # far above useful sizes, and below those that exceed any memory
 Width = Annotated[int, Field(ge=1, le=8192)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Piece = Literal["bc", "prior", "dice"]
 
 
 def prior_is_gaussian(prior: str, world: str | None) -> bool:
-    """Whether a prior is the Gaussian one: that of Bandit2D, if nothing is said.
+    """Whether a prior is the Gaussian one: by default on Bandit2D.
 
     :param prior: as in :class:`PretrainingConfig`
-    :param world: of the family; ``None`` for environments of one's own
+    :param world: of the family; ``None`` for a user's own environments
     """
     return prior == "gaussian" or (prior == "auto" and world == "bandit2d")
 
@@ -28,10 +28,10 @@ def prior_is_gaussian(prior: str, world: str | None) -> bool:
 class PretrainingConfig(BaseModel):
     """Settings of the offline stage; :class:`sb3_fedguide.offline.pretraining.Pretraining` takes them.
 
-    Lengths are in updates. ``*_epochs`` lengthens a piece to so many passes over the data; the updates are then a floor
-    (40 epochs of 5,000 rows are only 400 updates and leave a network untrained).
+    Lengths are in updates. ``*_epochs`` is the number of passes over the data if that is longer; the updates are then a
+    minimum (40 epochs of 5,000 rows are only 400 updates and leave a network untrained).
 
-    :param dataset: a Minari dataset (id or path, ``{client}`` stands for the client's number) instead of one made on the spot
+    :param dataset: a Minari dataset (id or path, ``{client}`` stands for the client's number) instead of a collected one
     :param dataset_size: rows per client; default 20,000, or 1,000 for Bandit2D; a given dataset is used whole
     :param gamma: discount factor of the DICE value
     :param prior: ``"gaussian"`` (state-independent), ``"diffusion"``, or ``"auto"``: Gaussian for Bandit2D
@@ -70,12 +70,12 @@ class PretrainingConfig(BaseModel):
     dice_v_coef: Annotated[float, Field(allow_inf_nan=False)] | Literal["1-gamma"] = 1.0
 
     def n_updates(self, piece: Piece, n_rows: int) -> int:
-        """Updates of a piece on ``n_rows`` rows: its floor, or its epochs if these are more."""
+        """Updates of a piece on ``n_rows`` rows: its minimum, or its epochs if these are more."""
         floor, epochs = getattr(self, f"{piece}_updates"), getattr(self, f"{piece}_epochs")
         return max(floor, (epochs or 0) * math.ceil(n_rows / getattr(self, f"{piece}_batch_size")))
 
     def settings(self, *pieces: str) -> dict[str, Any]:
-        """The fields that begin with one of ``pieces``, for a cache key; lengths are not among them."""
+        """The fields that begin with one of ``pieces``, without lengths, for a cache key."""
         return {
             name: value
             for name, value in self.model_dump(mode="json").items()
@@ -83,5 +83,5 @@ class PretrainingConfig(BaseModel):
         }
 
 
-#: As it is by default: the functions of the offline stage take their defaults from it.
+#: The default settings: the functions of the offline stage take their defaults from it.
 DEFAULTS = PretrainingConfig()

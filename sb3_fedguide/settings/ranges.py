@@ -1,4 +1,4 @@
-"""What numbers and choices a parameter takes: read off its type, wherever that stands, and checked in one way."""
+"""Numbers and choices that a parameter takes: read from its type, and checked in one way."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from collections.abc import Callable, Mapping
 from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple
 
-#: Smallest value of what must be positive.
+#: Smallest value of a positive parameter.
 OPEN = 1e-12
-#: Any integer stays below this.
+#: Upper bound of any integer.
 MAX_INTEGER = 2**31
 
 
 class Range(NamedTuple):
-    """A range of numbers, in the type of what it bounds: ``mu: Annotated[float, Range(0)]``.
+    """A range of numbers, in the type of a parameter: ``mu: Annotated[float, Range(0)]``.
 
-    :param why: what the message about another number adds to the bounds
-    :param without_high: ``high`` itself is not in it
-    :param start: what a schedule may begin with, where that is more than ``high``
+    :param why: reason that an error message adds to the bounds
+    :param without_high: ``high`` itself is excluded
+    :param start: largest first value of a schedule, if that is more than ``high``
     """
 
     low: float
@@ -37,7 +37,7 @@ class Range(NamedTuple):
         return f"{'(0' if self.low == OPEN else f'[{self.low:g}'}, {high}"
 
     def expected(self, number: float) -> str:
-        """What a number that is not in it must be."""
+        """The requirement, for the message about a number out of range."""
         if self.high <= 1:
             within = self.low == OPEN or self.without_high
             return f"in {self}" if within else f"between {self.low:g} and {self.high:g}"
@@ -47,7 +47,7 @@ class Range(NamedTuple):
 
 
 def options(hint: Any) -> list[Any]:
-    """The types of which a value may have any, without ranges."""
+    """The alternative types of a value, without ranges."""
     if typing.get_origin(hint) is typing.Annotated:
         return options(typing.get_args(hint)[0])
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
@@ -65,7 +65,7 @@ def is_schedule(option: Any) -> bool:
 
 
 def range_of(hint: Any) -> Range | None:
-    """The range in a type; of several, the first."""
+    """The first range in a type."""
     if typing.get_origin(hint) is typing.Annotated:
         found = [part for part in hint.__metadata__ if isinstance(part, Range)]
         return found[0] if found else range_of(typing.get_args(hint)[0])
@@ -81,10 +81,10 @@ def choices(hint: Any) -> list[Any]:
 
 
 def check_values(hints: Mapping[str, Any], values: Mapping[str, Any]) -> None:
-    """Check those of ``values`` that have a range or choices; of a schedule of the remaining progress, what it begins with.
+    """Check all ``values`` that have a range or choices; of a schedule of the remaining progress, its first value.
 
     :param hints: types by name
-    :raises ValueError: for the first that is none of its choices, no number or out of its range
+    :raises ValueError: for the first that is not one of its choices, not a number or out of its range
     """
     for name, hint in hints.items():
         if name in values:

@@ -1,4 +1,4 @@
-"""What the hyperparameters of an algorithm are, read off its constructors, and the check of plain values against them."""
+"""The hyperparameters of an algorithm, read from its constructors, and the check of plain values against them."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ from sb3_fedguide.settings.names import check_names
 from sb3_fedguide.settings.ranges import check_number, is_schedule, options, range_of
 from sb3_fedguide.settings.signatures import declared
 
-#: Constructor parameters that have a flag of their own or no meaning on the command line.
+#: Constructor parameters that have their own flag, or no meaning on the command line.
 NOT_HYPERPARAMETERS = {
     "policy", "env", "clients", "num_threads", "cache_dir", "tensorboard_log", "verbose", "seed", "device",
     "_init_setup_model",
 }  # fmt: skip
 
-#: A value that falls linearly to zero over the run, as in rl-baselines3-zoo; or one until a share of the run is over, then
-#: zero.
+#: ``lin_``: falls linearly to zero over the run, as in rl-baselines3-zoo; ``until_``: one for a share of the run, then zero.
 SCHEDULE = re.compile(r"^(?P<kind>lin|until)_(?P<value>\d+(\.\d*)?([eE][-+]?\d+)?)$")
 
 
 def declared_arguments(algo: str) -> type[FederationArguments]:
-    """The dataclass that an algorithm's constructor takes; of an algorithm of the user's own, that of its nearest base."""
+    """The dataclass that an algorithm's constructor takes; for a user's own algorithm, that of its nearest base."""
     known = ALGORITHMS[algo].arguments
     if known is None:
         taken: list[Any] = [getattr(vars(base).get("__init__"), "arguments", object) for base in algorithm(algo).__mro__]
@@ -55,7 +54,7 @@ def hyperparameters(algorithm: type) -> Mapping[str, tuple[Any, Any]]:
 
 
 def hyperparameters_of(algo: str) -> Mapping[str, tuple[Any, Any]]:
-    """:func:`hyperparameters` by command-line name. Of the algorithms that are here this does without PyTorch."""
+    """:func:`hyperparameters` by command-line name. For the shipped algorithms this does not import PyTorch."""
     entry = ALGORITHMS[algo]
     return hyperparameters(algorithm(algo) if entry.arguments is None else declared_arguments(algo))
 
@@ -78,7 +77,7 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
         number, scheduled = float(match["value"]), True
         if match["kind"] == "until":
             if name != "mix":
-                raise ValueError(f"{name}={value!r} is a schedule of mix alone; other values take one such as lin_3e-4")
+                raise ValueError(f"{name}={value!r} is a schedule for mix only; other values take one such as lin_3e-4")
             Until(number)
     else:
         try:
@@ -95,7 +94,7 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
 def check_model(name: str, model: type[pydantic.BaseModel], value: Any, excluded: Mapping[str, str]) -> pydantic.BaseModel:
     """A nested mapping against its model.
 
-    :param excluded: fields that are not to be set here, with what to do instead
+    :param excluded: fields that must not be set here, with the remedy
     :raises ValueError: one line that names the field
     """
     if not isinstance(value, Mapping):
@@ -114,7 +113,7 @@ def check_model(name: str, model: type[pydantic.BaseModel], value: Any, excluded
 
 
 def schedule_or_value(value: Any) -> Any:
-    """The schedule of a string such as ``lin_3e-4`` or ``until_0.5``; anything else as it is."""
+    """The schedule of a string such as ``lin_3e-4`` or ``until_0.5``; other values unchanged."""
     if isinstance(value, str) and (match := SCHEDULE.match(value)):
         if match["kind"] == "until":
             return Until(float(match["value"]))
@@ -126,7 +125,7 @@ def schedule_or_value(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Until:
-    """One until ``share`` of the run is over, then zero; of the remaining progress, as SB3's schedules.
+    """One for the first ``share`` of the run, then zero; a function of the remaining progress, as SB3's schedules.
 
     :raises ValueError: for a share outside [0, 1]
     """

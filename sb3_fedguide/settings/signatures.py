@@ -1,4 +1,4 @@
-"""What constructors take that hand keyword arguments on to their bases."""
+"""Complete signatures of constructors that pass keyword arguments on to their bases."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from sb3_fedguide.settings.ranges import plain
 
 P = ParamSpec("P")
 A = TypeVar("A")
-#: Arguments that may stand without their names.
+#: Positional arguments.
 FIRST = ("policy", "env")
 
 
 def takes(arguments: Callable[P, A]) -> Callable[[Callable[[Any, A], None]], Callable[Concatenate[Any, P], None]]:
-    """Of a constructor: it is called with the fields of a dataclass and gets them as one object, completed by defaults.
+    """Decorate a constructor: callers give the fields of a dataclass, and it gets them as one object with all defaults.
 
     :param arguments: the dataclass, such as :class:`~sb3_fedguide.settings.arguments.FedAvgArguments`
     """
@@ -42,7 +42,7 @@ def takes(arguments: Callable[P, A]) -> Callable[[Callable[[Any, A], None]], Cal
 
 
 def adds(arguments: Callable[..., A]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Of a mixin's constructor: as :func:`takes`, and what the dataclass does not know comes after it, to be handed on."""
+    """Decorate a mixin's constructor: as :func:`takes`, and arguments that the dataclass does not have are passed on."""
     names = [field.name for field in dataclasses.fields(arguments)]  # type: ignore[arg-type]
 
     def decorate(constructor: Callable[..., None]) -> Callable[..., None]:
@@ -73,8 +73,8 @@ def _given(arguments: Callable[P, A], whose: str, *args: P.args, **kwargs: P.kwa
 
 @functools.cache
 def declared(kind: Any) -> Mapping[str, tuple[Any, Any]]:
-    """Name to (type, default) of what a class or a dataclass of arguments takes: policy and environments, its own, then those
-    of its bases."""
+    """Name to (type, default) of the arguments of a class or dataclass: policy and environments, its own, then those of its
+    bases."""
     if not dataclasses.is_dataclass(kind):
         return {name: (parameter.annotation, parameter.default) for name, parameter in parameters(kind).items()}
     known = {field.name: field for field in dataclasses.fields(kind)}
@@ -101,12 +101,12 @@ def _hint(cls: type, hint: Any) -> Any:
 
 @functools.cache
 def types_of(kind: Any) -> Mapping[str, Any]:
-    """Name to type, with its range, of what a class or a dataclass of arguments takes."""
+    """Name to type, with its range, of the arguments of a class or dataclass."""
     return {name: hint for name, (hint, _) in declared(kind).items()}
 
 
 def constructors(cls: type) -> Iterator[Any]:
-    """The constructors of a class, its own first, up to the one that hands nothing on."""
+    """The constructors of a class, its own first, up to the one that passes nothing on."""
     for base in cls.__mro__:
         constructor = vars(base).get("__init__")
         if constructor is None:
@@ -118,7 +118,7 @@ def constructors(cls: type) -> Iterator[Any]:
 
 
 def parameters(cls: type) -> dict[str, inspect.Parameter]:
-    """Every parameter of these constructors by name, with its type resolved; what comes from a base takes a keyword only."""
+    """Every parameter of these constructors by name, with its type resolved; those of bases are keyword-only."""
     found: dict[str, inspect.Parameter] = {}
     for number, constructor in enumerate(constructors(cls)):
         for parameter in _stated(constructor):
@@ -128,7 +128,7 @@ def parameters(cls: type) -> dict[str, inspect.Parameter]:
 
 
 def _stated(constructor: Any) -> list[inspect.Parameter]:
-    """The parameters of one constructor, without those that it hands on."""
+    """The parameters of one constructor, without those that it passes on."""
     positional, keyword = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
     if hasattr(constructor, "arguments"):
         return [

@@ -29,7 +29,7 @@ def arrays_hash(arrays: Mapping[str, np.ndarray]) -> str:
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write arrays and their checksum as one npz file that appears complete or not at all.
 
-    :raises OSError: where it cannot be written
+    :raises OSError: if it cannot be written
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path, "wb") as file:
@@ -37,16 +37,16 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an npz file, whoever wrote it; nothing is unpickled, and a checksum is compared where there is one.
+    """The arrays of an npz file from any source; nothing is unpickled, and a checksum is compared if there is one.
 
-    :raises ValueError: if the file is damaged, no npz file, or holds pickled objects
+    :raises ValueError: if the file is damaged, not an npz file, or holds pickled objects
     :raises FileNotFoundError: if there is none
     """
     return _load(path, needs_checksum=False)
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read what :func:`write_arrays` wrote.
+    """Read a file of :func:`write_arrays`.
 
     :raises ValueError: if the file is damaged, pickled or does not have the checksum of its content
     :raises FileNotFoundError: if there is none
@@ -59,16 +59,16 @@ def _load(path: Path, needs_checksum: bool) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except Exception as error:  # zipfile, zlib, NumPy and the OS each have their own for the same thing
+    except Exception as error:  # zipfile, zlib, NumPy and the OS each have their own error for it
         raise _unreadable(path, error) from error
     checksum = arrays.pop(_CHECKSUM, None)
     if needs_checksum if checksum is None else str(checksum) != arrays_hash(arrays):
-        raise ValueError(f"{path} is damaged: its content does not have the checksum that was written with it")
+        raise ValueError(f"{path} is damaged: its content does not match its checksum")
     return arrays
 
 
 def array_mismatches(arrays: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray]) -> list[str]:
-    """How arrays differ from those expected in names, dtypes and shapes: one line each, nothing where they fit."""
+    """Differences of arrays from the expected ones in names, dtypes and shapes: one line each, none if they fit."""
     lines = [f"{name} is missing" for name in sorted(expected.keys() - arrays.keys())]
     lines += [f"{name} is not known" for name in sorted(arrays.keys() - expected.keys())]
     for name in sorted(arrays.keys() & expected.keys()):
@@ -79,7 +79,7 @@ def array_mismatches(arrays: Mapping[str, np.ndarray], expected: Mapping[str, np
 
 
 def _refuse_compression(path: Path) -> None:
-    """Nothing that we write is compressed, so that a file never takes more memory than it takes on the disk."""
+    """Refuse compressed arrays: we write none, so that a file never takes more memory than disk space."""
     try:
         with zipfile.ZipFile(path) as archive:
             compressed = [entry.filename for entry in archive.infolist() if entry.compress_type != zipfile.ZIP_STORED]

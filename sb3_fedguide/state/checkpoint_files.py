@@ -1,6 +1,6 @@
-"""Checkpoint files: one npz file each, plain arrays and a JSON text, written complete or not at all. Needs nothing but NumPy.
+"""Checkpoint files: one npz file each, plain arrays and a JSON text, written complete or not at all. Needs only NumPy.
 
-Nothing in them is pickled, and a file whose content does not have the checksum that was written with it is not used.
+Nothing in them is pickled, and a file whose content does not match its checksum is not used.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 from fed_envs.plain_data import TAG, State
 from sb3_fedguide.state.array_files import read_arrays, write_arrays
 
-#: How many checkpoints stay: the newest may turn out to be damaged.
+#: Number of checkpoints to keep: the newest may be damaged.
 KEPT = 2
-#: Raised whenever what a checkpoint holds changes, so that another version's is refused.
+#: Increased with every change of a checkpoint's content, so that another version's is refused.
 FORMAT = 3
 _JSON = "state.json"
 _NAME = re.compile(r"round_(\d+)\.npz")
@@ -28,7 +28,7 @@ def write_checkpoint(folder: str | Path, round: int, state: State) -> Path:
     """Write ``round_<number>.npz``, and remove all but the newest :data:`KEPT`.
 
     :param state: dicts with text for keys, lists, arrays and JSON values
-    :raises OSError: where it cannot be written; what was there before stays
+    :raises OSError: if it cannot be written; earlier checkpoints stay
     """
     arrays: dict[str, np.ndarray] = {}
     text = json.dumps({"format": FORMAT, "state": _without_arrays(state, "", arrays)}, allow_nan=False)
@@ -41,7 +41,7 @@ def write_checkpoint(folder: str | Path, round: int, state: State) -> Path:
 def read_checkpoint(path: str | Path) -> State:
     """What :func:`write_checkpoint` wrote.
 
-    :raises ValueError: for a file that is damaged, of another version or something else
+    :raises ValueError: for a file that is damaged, of another version or not a checkpoint
     :raises FileNotFoundError: if there is none
     """
     arrays = read_arrays(Path(path))
@@ -49,12 +49,12 @@ def read_checkpoint(path: str | Path) -> State:
         content = json.loads(arrays[_JSON].tobytes())
         if content["format"] != FORMAT:
             raise ValueError(
-                f"{path} has format {content['format']!r} and this version reads {FORMAT}: go on with the version of the "
+                f"{path} has format {content['format']!r} and this version reads {FORMAT}: resume it with the version of the "
                 "package that wrote it"
             )
         return _with_arrays(content["state"], arrays)
     except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is no checkpoint: {error!r}") from None
+        raise ValueError(f"{path} is not a checkpoint: {error!r}") from None
 
 
 def checkpoints(folder: str | Path) -> list[Path]:
@@ -72,15 +72,15 @@ def remove_old(folder: str | Path) -> None:
 
 
 def remove_leftovers(folder: str | Path) -> None:
-    """Remove what a process left half-written that was killed."""
+    """Remove half-written files of a killed process."""
     for leftover in Path(folder).glob(".round_*.part"):
         leftover.unlink()
 
 
 def newest_checkpoint(folder: str | Path) -> tuple[Path, State] | None:
-    """The newest intact checkpoint; ``None`` where there is none at all. Damaged ones are named in a warning.
+    """The newest intact checkpoint; ``None`` if the folder has no checkpoint. A warning names damaged ones.
 
-    :raises ValueError: if none of those that are there can be read
+    :raises ValueError: if there are checkpoints, but none can be read
     """
     problems = []
     for path in reversed(checkpoints(folder)):
@@ -90,7 +90,7 @@ def newest_checkpoint(folder: str | Path) -> tuple[Path, State] | None:
             problems.append(str(error))
             continue
         for problem in problems:
-            warnings.warn(f"{problem}; going on from the one before it, {path.name}", stacklevel=2)
+            warnings.warn(f"{problem}; resuming from the one before it, {path.name}", stacklevel=2)
         return path, state
     if problems:
         raise ValueError(f"no checkpoint can be read: {'; '.join(problems)}")
@@ -98,7 +98,7 @@ def newest_checkpoint(folder: str | Path) -> tuple[Path, State] | None:
 
 
 def _without_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
-    """``value`` with each array replaced by its name in ``arrays``, where it is put."""
+    """``value`` with each array moved to ``arrays`` and replaced by its name there."""
     if isinstance(value, dict):
         return {key: _without_arrays(item, f"{path}/{key}", arrays) for key, item in value.items()}
     if isinstance(value, list):

@@ -1,7 +1,7 @@
-"""A federation's state for some of its clients, and of several such parts in one.
+"""Split a federation's state by clients, and join such parts to one state.
 
-What :meth:`Federation.save_state` returns has a client axis everywhere: the first of arrays and lists. Where a client has
-several environments, it may have as many neighbouring entries. What belongs to no client the algorithm declares as shared.
+All entries of :meth:`Federation.save_state` have a client axis: the first of arrays and lists. A client with several
+environments may have as many neighbouring entries. The algorithm declares an entry that belongs to no client as shared.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def take_clients(state: State, positions: Sequence[int], n_clients: int, shared:
 
     :param state: of ``n_clients`` clients
     :param shared: entries that belong to no client, such as ``"random"``
-    :raises ValueError: for an entry without a client axis that is not said to be shared
+    :raises ValueError: for an entry without a client axis that is not declared as shared
     """
 
     def take(values: Sequence[Any], path: str) -> Any:
@@ -36,7 +36,7 @@ def take_clients(state: State, positions: Sequence[int], n_clients: int, shared:
 def join_clients(parts: Sequence[State], shared: Collection[str]) -> State:
     """The inverse of :func:`take_clients`: one state of all clients, in the order of the parts.
 
-    :param shared: as for :func:`take_clients`; of such entries the first part's are taken
+    :param shared: as for :func:`take_clients`; these entries are taken from the first part
     """
 
     def join(values: Sequence[Any], path: str) -> Any:
@@ -80,7 +80,7 @@ def _pairs(values: Sequence[State]) -> Iterator[tuple[Any, list[Any]]]:
 
 
 def _rows(value: np.ndarray | list[Any], path: str, n_clients: int, positions: Sequence[int]) -> list[int]:
-    """Where the entries of the clients at ``positions`` are."""
+    """Indices of the entries of the clients at ``positions``."""
     each, rest = divmod(len(value), n_clients)
     if rest or not each:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What an algorithm holds from round to round: declared once, for checkpoints, engines and parameter files."""
+"""State that an algorithm keeps between rounds: declared once, for checkpoints, engines and parameter files."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class Held:
     """An entry of an algorithm's ``state_attributes``; a name alone is one with all defaults.
 
     The attribute is plain data (see :func:`fed_envs.plain_data.freeze`), an ``nn.Module``, or has ``save_state()`` and
-    ``load_state(state)``. The first axis of its arrays and lists is the clients'.
+    ``load_state(state)``. The first axis of its arrays and lists is the client.
 
-    :param name: of the attribute, with dots for an attribute's own (``"noise.state"``)
+    :param name: of the attribute, with dots for nested attributes (``"noise.state"``)
     :param shared: all clients have the same; it has no client axis
-    :param part: what parameter files call it together with what comes with it; they leave it out by default
-    :param file: in parameter files, the name of its array, or what the names of its arrays begin with; without a name they do
-        not hold it, and it begins anew where its part comes from a file
-    :param later: rounds give it, and not the offline stage; files leave it out as long as it is NaN
+    :param part: its part of parameter files, which several attributes may share; without one, the files leave it out
+    :param file: in parameter files, the name of its array, or the prefix of its arrays' names; without one, the files do
+        not hold it, and it begins anew if its part is read from a file
+    :param later: rounds make it, not the offline stage; files leave it out as long as it is NaN
     """
 
     name: str
@@ -36,15 +36,15 @@ class Held:
 
 
 def held_by(owner: Any) -> dict[str, Held]:
-    """What the classes of ``owner`` declare in ``state_attributes``, by attribute."""
+    """The declarations of ``owner``'s classes in ``state_attributes``, by attribute."""
     entries = [entry for kind in reversed(type(owner).__mro__) for entry in vars(kind).get("state_attributes", ())]
     return {held.name: held for held in (entry if isinstance(entry, Held) else Held(entry) for entry in entries)}
 
 
 def save_held(owner: Any, shared: bool = False) -> State:
-    """What ``owner`` holds for its clients each, or for all together, as plain data by attribute.
+    """The state of ``owner`` for each client, or the state that all share, as plain data by attribute.
 
-    :raises ValueError: for an attribute that is no plain data
+    :raises ValueError: for an attribute that is not plain data
     """
     names = [held.name for held in held_by(owner).values() if held.shared == shared]
     values = {name: value for name in names if (value := recursive_getattr(owner, name, owner)) is not owner}
@@ -55,7 +55,7 @@ def save_held(owner: Any, shared: bool = False) -> State:
 
 
 def load_held(owner: Any, state: State) -> None:
-    """Put back what :func:`save_held` returned."""
+    """Restore the state from :func:`save_held`."""
     for name, saved in state.items():
         value = recursive_getattr(owner, name, None)
         if isinstance(value, nn.Module):
@@ -67,7 +67,7 @@ def load_held(owner: Any, state: State) -> None:
 
 
 def file_arrays(owner: Any, held: Held) -> dict[str, np.ndarray]:
-    """The arrays of an attribute themselves, no copies, by their names in parameter files."""
+    """The arrays of an attribute, not copied, by their names in parameter files."""
     if not held.file:
         return {}
     value = recursive_getattr(owner, held.name)

@@ -18,7 +18,7 @@ def optimizer_state(optimizer: th.optim.Optimizer) -> State:
 
 
 def load_optimizer(optimizer: th.optim.Optimizer, saved: State) -> None:
-    """Go on from what :func:`optimizer_state` returned, with parameters of the same shapes."""
+    """Restore the state from :func:`optimizer_state`, for parameters of the same shapes."""
     state = optimizer.state_dict()
     state["state"] = {index: to_tensors(arrays) for index, arrays in enumerate(saved["parameters"]) if arrays}
     for group, learning_rate in zip(state["param_groups"], saved["learning_rates"], strict=True):

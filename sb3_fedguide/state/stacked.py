@@ -43,7 +43,7 @@ def stack_module(module: nn.Module, n_clients: int) -> nn.Module:
     """A module that holds ``n_clients`` copies of ``module``, with the same parameter names.
 
     :param module: built of ``nn.Sequential``, ``nn.Linear`` and parameter-free modules (activations)
-    :raises TypeError: for a module with parameters that is neither
+    :raises TypeError: for any other module with parameters
     """
     if isinstance(module, nn.Linear):
         if module.bias is None:
@@ -57,9 +57,9 @@ def stack_module(module: nn.Module, n_clients: int) -> nn.Module:
 
 
 def fixed_forward(layers: Iterable[nn.Module]) -> Callable[[th.Tensor], th.Tensor]:
-    """A chain's forward pass with its present weights, bit for bit, at a third of the price for a few rows.
+    """A chain's forward pass with its current weights, bit for bit, in a third of the time for a few rows.
 
-    It neither records gradients nor goes through module calls, which cost more than the arithmetic of a rollout's step.
+    It neither records gradients nor calls modules: their calls cost more than the arithmetic of a rollout's step.
 
     :param layers: stacked affine maps and activations, in order; ``nn.Sequential`` may nest
     :return: maps ``(n_clients, batch, in_features)`` to ``(n_clients, batch, out_features)``
@@ -104,7 +104,7 @@ def to_tensors(arrays: Mapping[str, np.ndarray]) -> dict[str, th.Tensor]:
 
 
 def clip_grad_norm_per_client(parameters: Sequence[th.nn.Parameter], max_norm: float) -> th.Tensor:
-    """``clip_grad_norm_`` for each client by itself; returns the norms before clipping, ``(n_clients,)``."""
+    """``clip_grad_norm_`` for each client separately; returns the norms before clipping, ``(n_clients,)``."""
     grads = [parameter.grad for parameter in parameters if parameter.grad is not None]
     norms = th.linalg.vector_norm(th.stack([th.linalg.vector_norm(g.flatten(1), dim=1) for g in grads], dim=1), dim=1)
     scale = th.clamp(max_norm / (norms + 1e-6), max=1.0)
