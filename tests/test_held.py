@@ -34,9 +34,11 @@ class Scaled(FedAvg):
 
     def _setup_state(self):
         super()._setup_state()
-        zeros = np.zeros(self.n_clients)
-        self.hold(scales=zeros + 1, sums=zeros * np.nan, counts={"rounds": zeros.astype(int)})
-        self.hold(table=th.nn.Linear(3, 5).requires_grad_(False))  # as many rows as there are clients, or more
+        n = self.n_clients
+        self.hold(
+            scales=lambda: np.ones(n), sums=lambda: np.full(n, np.nan), counts=lambda: {"rounds": np.zeros(n, dtype=int)}
+        )
+        self.hold(table=lambda: th.nn.Linear(3, 5).requires_grad_(False))  # as many rows as there are clients, or more
 
     def _finish_training(self):
         for index in np.flatnonzero(self.present):
