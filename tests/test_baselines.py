@@ -90,6 +90,15 @@ def test_the_anchor_is_the_last_broadcast(point_envs, small, cls):
         assert not th.equal(parameters_of(model, client)["action_net.weight"], broadcast["action_net.weight"])
 
 
+@pytest.mark.parametrize("cls", [FedProx, FedKL])
+def test_a_broadcast_before_any_training_is_an_anchor(point_envs, small, cls):
+    model = cls("MlpPolicy", point_envs(2), **small)
+    initial, broadcast = parameters_of(model, 1), {name: array + 1 for name, array in model.averaged_parameters(0).items()}
+    model.receive(0, broadcast)
+    for client, expected in enumerate([{name: th.as_tensor(array) for name, array in broadcast.items()}, initial]):
+        assert_same_parameters({name: th.as_tensor(array[client]) for name, array in model.anchor.items()}, expected)
+
+
 def test_fedprox_stays_nearer_to_the_broadcast(point_envs, small):
     moved = []
     for mu in (0.0, 100.0):

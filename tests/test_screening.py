@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sb3_fedguide import FedAvg, FederatedEvalCallback, FedRL
+from sb3_fedguide.common.checkpoint import CheckpointCallback
 from sb3_fedguide.common.participation import simulate_delays
 from sb3_fedguide.common.screening import LONGEST_WAIT, clearly_better
 from sb3_fedguide.server.delays import parse_delays
@@ -154,3 +155,15 @@ def test_a_saved_model_remembers_who_is_alone(trained, point_envs, tmp_path):
     trained.save(tmp_path / "model")
     loaded = FedAvg.load(tmp_path / "model", env=point_envs(3))
     assert loaded.upload(2)[N_SAMPLES] == 0 and loaded.upload(1)[N_SAMPLES] == 128
+
+
+@pytest.mark.filterwarnings("ignore:the environments of clients")
+def test_tests_may_begin_later(point_envs, tmp_path):
+    off = {**SCREENED, "screening": 0.0}
+    model = FedAvg("MlpPolicy", point_envs(3), **off)
+    model.learn(2 * 3 * 128, CheckpointCallback(tmp_path, 1))
+    resumed = FedAvg("MlpPolicy", point_envs(3), **SCREENED).resume(tmp_path)
+    model.screening = 0.5
+    for other in (resumed, model):
+        other.learn(2 * 3 * 128, reset_num_timesteps=False)
+        assert other.test_steps > 0 and other.screening_state["steps"].any()

@@ -166,7 +166,7 @@ def test_what_a_site_refuses(tmp_path):
     again.model.play_round = None  # type: ignore[method-assign, assignment]
     with pytest.raises(TypeError):
         again.handle(request("round", 2))
-    with pytest.raises(RuntimeError, match="a new Site goes on from the disk"):
+    with pytest.raises(RuntimeError, match="make a new Site, which resumes from disk"):
         again.handle(request("round", 2))
 
 

@@ -83,11 +83,11 @@ class FedGuide(FederatedPPO):
     score_moments: np.ndarray  # S_i of the score cost, (n_clients, p + 1, p + 1); stay with their client
     experts: np.ndarray  # last received by each client, (n_clients, n_experts, action_dim, p + 1); NaN before
     mixture_rows: np.ndarray  # R_i, (n_clients, n_experts); NaN before the first plan
-    dice: DiceValue | None = None
-    dice_scale: np.ndarray | None = None  # (n_clients, 2): a and b of the calibration
-    calibrated: np.ndarray | None = None  # (n_clients,) bool
-    offline_statistics: Parameters | None = None  # of each client's head, by the fields of HeadStatistics
-    recent_statistics: Parameters | None = None
+    dice: DiceValue | None
+    dice_scale: np.ndarray | None  # (n_clients, 2): a and b of the calibration
+    calibrated: np.ndarray | None  # (n_clients,) bool
+    offline_statistics: Parameters | None  # of each client's head, by the fields of HeadStatistics
+    recent_statistics: Parameters | None
 
     @takes(FedGuideArguments)
     def __init__(self, given: FedGuideArguments) -> None:
@@ -112,25 +112,47 @@ class FedGuide(FederatedPPO):
 
     def _setup_state(self) -> None:
         super()._setup_state()
-        assert self.seed is not None
-        n, (obs_dim,), (action_dim,) = self.n_clients, self.observation_space.shape, self.action_space.shape  # type: ignore[misc]
-        self.hold(prior=untrained_prior(self.family, self.pretraining_config, obs_dim, action_dim, self.seed))
-        size = self.prior.n_features + 1
-        self.hold(heads=np.zeros((n, action_dim, size), dtype=np.float32), score_moments=np.zeros((n, size, size)))
-        experts, rows = self._no_experts(self.n_experts or n)
-        self.hold(experts=experts, mixture_rows=rows)
-        if self.adapt == "advantage":
-            offline, recent = ({"gram": np.zeros((n, size, size)), "cross": np.zeros((n, size, action_dim))} for _ in range(2))
-            self.hold(offline_statistics=offline, recent_statistics={**recent, "weight": np.zeros(n)})
-        if self.uses_dice:
-            self.hold(dice=DiceValue(n, obs_dim, self.pretraining_config.dice_width).requires_grad_(False))
-            if self.calibrate:
-                self.hold(dice_scale=np.tile([1.0, 0.0], (n, 1)), calibrated=np.zeros(n, dtype=bool))
+        adapts, calibrates = self.adapt == "advantage", self.uses_dice and self.calibrate
+        if adapts and self.pretrained and vars(self).get("offline_statistics") is None:
+            raise ValueError(
+                "adapt='advantage' refits heads on the offline data too, and this model went through the offline stage with "
+                "adapt='none', which keeps nothing of them; make a new model with adapt='advantage', or leave it at 'none'"
+            )
+        n = self.n_clients
+        self.hold(
+            prior=self._untrained_prior,
+            heads=lambda: np.zeros((n, *self.prior.head_shape), dtype=np.float32),
+            score_moments=lambda: np.zeros((n, *self._gram_shape)),
+            offline_statistics=self._no_statistics if adapts else None,
+            recent_statistics=(lambda: {**self._no_statistics(), "weight": np.zeros(n)}) if adapts else None,
+            dice=self._untrained_dice if self.uses_dice else None,
+            experts=lambda: self._no_experts(self.n_experts or n),
+            mixture_rows=lambda: np.full((n, self.n_experts or n), np.nan, np.float32),
+            dice_scale=(lambda: np.tile([1.0, 0.0], (n, 1))) if calibrates else None,
+            calibrated=(lambda: np.zeros(n, dtype=bool)) if calibrates else None,
+        )
 
-    def _no_experts(self, n_experts: int) -> tuple[np.ndarray, np.ndarray]:
-        """Experts and rows of clients that have not yet received any."""
-        shape = self.n_clients, n_experts
-        return np.full((*shape, *self.prior.head_shape), np.nan, np.float32), np.full(shape, np.nan, np.float32)
+    def _untrained_prior(self) -> Prior:
+        assert self.seed is not None
+        (obs_dim,), (action_dim,) = self.observation_space.shape, self.action_space.shape  # type: ignore[misc]
+        return untrained_prior(self.family, self.pretraining_config, obs_dim, action_dim, self.seed)
+
+    def _untrained_dice(self) -> DiceValue:
+        (obs_dim,) = self.observation_space.shape  # type: ignore[misc]
+        return DiceValue(self.n_clients, obs_dim, self.pretraining_config.dice_width).requires_grad_(False)
+
+    @property
+    def _gram_shape(self) -> tuple[int, int]:
+        return (self.prior.n_features + 1,) * 2
+
+    def _no_statistics(self) -> Parameters:
+        """Of a head that has seen no data, by the fields of HeadStatistics but for the weight."""
+        gram, cross = self._gram_shape, self.prior.head_shape[::-1]
+        return {"gram": np.zeros((self.n_clients, *gram)), "cross": np.zeros((self.n_clients, *cross))}
+
+    def _no_experts(self, n_experts: int) -> np.ndarray:
+        """Experts of clients that have received none."""
+        return np.full((self.n_clients, n_experts, *self.prior.head_shape), np.nan, np.float32)
 
     def upload(self, index: int) -> Payload:
         payload: Payload = {HEAD: self.heads[index]}
@@ -140,8 +162,10 @@ class FedGuide(FederatedPPO):
         return payload
 
     def receive(self, index: int, broadcast: Payload) -> None:
-        if len(broadcast[EXPERTS]) != self.experts.shape[1]:  # a site does not know the server's number of experts
-            self.experts, self.mixture_rows = self._no_experts(len(broadcast[EXPERTS]))
+        n_experts = len(broadcast[EXPERTS])
+        if n_experts != self.mixture_rows.shape[1]:  # a site does not know how many the server has
+            self.experts = self._no_experts(n_experts)
+            self.mixture_rows = np.full((self.n_clients, n_experts), np.nan, np.float32)
         self.experts[index] = broadcast[EXPERTS]
         if MIXTURE_ROW in broadcast:
             self.mixture_rows[index] = broadcast[MIXTURE_ROW]

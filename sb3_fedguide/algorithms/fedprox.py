@@ -28,10 +28,14 @@ class AnchoredFedAvg(FedAvg):
 
     def _begin_learning(self, environments_were_reset: bool) -> None:
         super()._begin_learning(environments_were_reset)
+        self._begin_anchor()
+
+    def _begin_anchor(self) -> None:
         if not self.anchor:
             self.anchor = snapshot(self.policy, self.averaged_prefixes)
 
     def receive(self, index: int, broadcast: Payload) -> None:
+        self._begin_anchor()
         super().receive(index, broadcast)
         for name, array in broadcast.items():
             self.anchor[name][index] = array

@@ -60,10 +60,16 @@ class FedSVRPGM(FedAvg):
         super().__init__(**given.of(FedAvgArguments))
 
     def _setup_state(self) -> None:
-        actors = snapshot(self.policy, ACTOR_PREFIXES)
-        zeros, more_zeros = ({name: np.zeros_like(array) for name, array in actors.items()} for _ in range(2))
-        self.hold(reference=actors, reference_period=np.full(self.n_clients, -1), momentum=zeros, directions=more_zeros)
-        super()._setup_state()  # reads the names of uploaded parameters
+        super()._setup_state()
+        self.hold(
+            reference=lambda: snapshot(self.policy, ACTOR_PREFIXES),
+            reference_period=lambda: np.full(self.n_clients, -1),
+            momentum=self._no_directions,
+            directions=self._no_directions,
+        )
+
+    def _no_directions(self) -> Parameters:
+        return {name: np.zeros_like(array) for name, array in snapshot(self.policy, ACTOR_PREFIXES).items()}
 
     def upload(self, index: int) -> Payload:
         """Parameters and number of samples as in FedAvg, and ``direction.<actor parameter>``."""
@@ -72,9 +78,8 @@ class FedSVRPGM(FedAvg):
         return payload
 
     def public_parameters(self) -> Parameters:
-        directions = snapshot(self.policy, ACTOR_PREFIXES)
-        zeros = {DIRECTION + name: np.zeros_like(array) for name, array in directions.items()}
-        return {**super().public_parameters(), **zeros}
+        directions = {DIRECTION + name: array for name, array in self._no_directions().items()}
+        return {**super().public_parameters(), **directions}
 
     def receive(self, index: int, broadcast: Payload) -> None:
         super().receive(index, {name: array for name, array in broadcast.items() if not name.startswith(DIRECTION)})

@@ -153,6 +153,7 @@ class Federation(CheckedKeywords, FederatedEnvironments, EpisodeStatistics, Exch
         """
         if self.env is None:
             raise ValueError(f"this {type(self).__name__} has no environments to train in; give it some with set_env()")
+        self._setup_state()  # settings may be other ones now
         self.pretrain(progress_bar)
         total_timesteps, callbacks, rounds = self.start_learning(
             total_timesteps, callback, tb_log_name, reset_num_timesteps, progress_bar

@@ -73,10 +73,13 @@ class ParameterAveraging(Federation):
         self._shares: dict[int, float] = {}
         super().__init__(*args, **learner)
 
+    def _setup_model(self) -> None:
+        super()._setup_model()  # type: ignore[safe-super]
+        self._privacy.begin()
+
     def _setup_state(self) -> None:
         super()._setup_state()
         self._tests.begin()
-        self._privacy.begin()
 
     def _identity(self) -> dict[str, Any]:
         privacy = {"noise_multiplier": self.noise_multiplier or None, "clipping_norm": self.clipping_norm}

@@ -90,7 +90,7 @@ class ParameterFiles(ClientPolicies, Resumable):
 
 def _exported(model: ParameterFiles) -> list[Held]:
     """State in this model's files beside policies and normalisation, after the offline stage."""
-    return [held for held in held_by(model).values() if held.part and getattr(model, held.name, None) is not None]
+    return [held for held in held_by(model).values() if held.part and model.holds(held.name)]
 
 
 def _complete_parts(model: ParameterFiles) -> list[str]:
@@ -144,15 +144,14 @@ def _read(model: ParameterFiles, path: str | Path) -> None:
             f"{path} does not fit this {type(model).__name__}: {'; '.join(differences)}; for its policies alone, without a "
             "federation, there is 'fedguide export'"
         )
+    here = [held for held in _exported(model) if held.file and held.part in header["parts"]]
+    if model.pretrained:  # otherwise everything is new
+        model.begin_anew(held.name for held in _exported(model) if held not in here)
+    for held in here:
+        for name, array in file_arrays(model, held).items():
+            array[...] = arrays[name]
     model.policy.load_state_dict(to_tensors(take_prefix(arrays, "policy/")))
     model.normalizer.load_state_dict(to_tensors(take_prefix(arrays, "normalizer/")), strict=False)
-    for held in _exported(model):
-        vars(model).pop(held.name)
-    model._setup_state()
-    for held in _exported(model):
-        if held.part in header["parts"]:
-            for name, array in file_arrays(model, held).items():
-                array[...] = arrays[name]
     model.pretrained = header["pretrained"]
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
+from torch import nn
 
 from fed_envs import FederatedVecEnv
 from fed_envs.state import State, freeze, thaw
@@ -52,6 +55,8 @@ class Resumable(BaseAlgorithm):
     family: Any
     #: of the resumed run, until its callbacks exist
     _callback_states: Sequence[State] = ()
+    #: what :meth:`hold` was told
+    _makers: Mapping[str, Callable[[], Any] | None] = MappingProxyType({})
 
     @abstractmethod
     def _optimizers(self) -> list[th.optim.Optimizer]:
@@ -68,13 +73,68 @@ class Resumable(BaseAlgorithm):
         }
 
     def _setup_state(self) -> None:
-        """Set the initial state of a new model, in its final shapes: the last step of ``_setup_model()``."""
+        """Say what a model of this method holds with its settings: the last of what ``_setup_model()`` does.
 
-    def hold(self, **values: Any) -> None:
-        """Set the attributes ``values`` unless they came with a saved model: for :meth:`_setup_state`."""
-        for name, value in values.items():
-            if getattr(self, name, None) is None:
-                setattr(self, name, value)
+        It is called again where training begins and where a state is taken, and leaves alone what is there."""
+
+    def hold(self, **makers: Callable[[], Any] | None) -> None:
+        """Hold attributes, for :meth:`_setup_state`. One that did not come with a saved model is made when it is first read.
+
+        :param makers: by attribute, a function that makes what a new model begins with, in its final shapes; ``None`` where
+            the model's settings do without it
+        :raises TypeError: for something else, and for an attribute that the class gives a value
+        """
+        for name, make in makers.items():
+            if make is not None and (not callable(make) or isinstance(make, nn.Module)):
+                raise TypeError(
+                    f"hold({name}=...) takes a function that makes it, 'lambda: ...', and not the {type(make).__name__}"
+                )
+            if hasattr(type(self), name):
+                raise TypeError(
+                    f"{type(self).__name__}.{name} hides what hold({name}=...) makes; only annotate it in the class"
+                )
+            if make is None:
+                setattr(self, name, None)
+            elif vars(self).get(name, make) is None:
+                delattr(self, name)
+        self._makers = {**self._makers, **makers}
+
+    def holds(self, name: str) -> bool:
+        """Whether there is something in an attribute, or will be when it is first read."""
+        return self._makers.get(name) is not None or recursive_getattr(self, name, None) is not None
+
+    def begin_anew(self, names: Iterable[str]) -> None:
+        """Let attributes be what :meth:`hold` makes of them.
+
+        :raises ValueError: for those that :meth:`hold` does not know; then all stay as they are
+        """
+        names = list(names)
+        unknown = [name for name in names if self._makers.get(name) is None]
+        if unknown:
+            raise ValueError(
+                f"{', '.join(unknown)} would have to begin anew, and {type(self).__name__} does not say how: give hold() a "
+                "function that makes it, in _setup_state()"
+            )
+        for name in names:
+            vars(self).pop(name, None)
+
+    if not TYPE_CHECKING:  # where it would vouch for attributes that nobody has
+
+        def __getattr__(self, name: str) -> Any:
+            make = self._makers.get(name)
+            if make is None:
+                return object.__getattribute__(self, name)  # raises what says that there is none
+            value = make()
+            setattr(self, name, value)
+            return value
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_makers"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if "policy" in state:  # _setup_model() has been there
+            self._setup_state()
 
     def save_state(self) -> State:
         """Policies, optimisers, server, normalisation, random streams, environments and counters; only between two rounds.
@@ -112,7 +172,16 @@ class Resumable(BaseAlgorithm):
         mismatches = array_mismatches(state["policy"], to_arrays(self.policy.state_dict()))
         if mismatches:
             raise ValueError(f"the state's policies do not fit: {mismatches[0]}")
-        load_held(self, {**state["attributes"], **state["shared"]})
+        held = {**state["attributes"], **state["shared"]}
+        for name, make in self._makers.items():
+            if name in held and (make is None) != (held[name] is None):
+                theirs, ours = ("holds", "none") if make is None else ("holds no", "one")
+                raise ValueError(
+                    f"the state does not fit: it {theirs} {name}, and a {type(self).__name__} with these settings has {ours}; "
+                    "make the model with the settings of the one that gave the state"
+                )
+        load_held(self, held)
+        self._setup_state()
         self.policy.load_state_dict(to_tensors(state["policy"]))
         for optimizer, saved in zip(self._optimizers(), state["optimizers"], strict=True):
             load_optimizer(optimizer, saved)
@@ -182,7 +251,7 @@ class Resumable(BaseAlgorithm):
         return env
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_callback_states"]
+        return [*super()._excluded_save_params(), "_callback_states", "_makers"]
 
     def _forgotten(self, saved: Collection[str]) -> list[str]:
         """Attributes with arrays that are neither saved nor declared as transient."""

@@ -100,7 +100,7 @@ def describe(model: Federation, positions: Sequence[int]) -> bytes:
     env = model._federated_env()
     source = env.family if env.family is not None else env._factories
     per_round = {*model._excluded_save_params(), "strategy", "present", "outdated", "_last_obs", "_last_episode_starts"}
-    learned = held_by(model).keys() - {"seed", "pretrained"}
+    learned = held_by(model).keys() - {"seed"}
     attributes = {
         name: value
         for name, value in vars(model).items()

@@ -57,7 +57,7 @@ def save_held(owner: Any, shared: bool = False) -> State:
 def load_held(owner: Any, state: State) -> None:
     """Restore the state from :func:`save_held`."""
     for name, saved in state.items():
-        value = recursive_getattr(owner, name, None)
+        value: Any = recursive_getattr(owner, name, None) if isinstance(saved, dict) else None  # arrays need none to go into
         if isinstance(value, nn.Module):
             value.load_state_dict(to_tensors(saved))
         elif hasattr(value, "load_state"):
