@@ -94,10 +94,6 @@ class FederatedRolloutBuffer:
         self.extras: dict[str, th.Tensor] = {}
 
     @property
-    def full(self) -> bool:
-        return self.pos == self.n_steps
-
-    @property
     def n_rows(self) -> int:
         """Rows per client."""
         return self.n_steps * self.n_envs_per_client
