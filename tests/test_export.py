@@ -137,7 +137,7 @@ def test_onnx(point_envs, small, tmp_path):
 
 def test_unknown_suffixes_and_missing_packages_are_one_sentence(point_envs, small, tmp_path, monkeypatch):
     model = Local("MlpPolicy", point_envs(1), **small)
-    with pytest.raises(ValueError, match=r"has to be \.zip, \.pt2, \.pt, \.onnx"):
+    with pytest.raises(ValueError, match=r"must be one of \.zip, \.pt2, \.pt, \.onnx"):
         model.export(0, tmp_path / "client.pth")
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ValueError, match=r"onnx is not installed: pip install 'sb3-fedguide\[onnx\]'"):

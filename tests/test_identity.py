@@ -88,7 +88,7 @@ def test_another_number_of_copies(algorithm, tmp_path):
     for bad, message in ((3, "n_envs_per_client=3 must divide rollout_size=40"),):
         with pytest.raises(ValueError, match=message):
             algorithm.load(path, env=FederatedVecEnv("Bandit2D", n_envs_per_client=bad))
-    with pytest.raises(ValueError, match=r"set_env\(\) keeps the number .* 1 and not 2; .*load"):
+    with pytest.raises(ValueError, match=r"set_env\(\) keeps the number .*: 1, not 2; .*load"):
         model.set_env(FederatedVecEnv("Bandit2D", n_envs_per_client=2))
     again = algorithm.load(path, env="Bandit2D", n_envs_per_client=4)
     assert again.learn(1).num_timesteps == 160 and again.n_envs == 16

@@ -135,7 +135,7 @@ DIFFERENT = {
     "clients is [0, 1, 2, 3] in the file and [0, 2] here": ("local", Local, {"clients": [0, 2]}),
     "action_low is ['-1.5', '-1.5'] in the file and ['-1.0', '-1.0'] here": ("local", Local, {"env": "Reacher"}),
     "policy is 'StackedMlpPolicy' in the file and 'StackedDDPGPolicy' here": ("local", FedRL, {}),
-    "the file holds dice, experts, prior, which this method has not": ("fedguide", Local, {}),
+    "the file holds dice, experts, prior, which this method does not have with its settings": ("fedguide", Local, {}),
     "dice/net.bias_0 is float32 (4, 1, 16) instead of float32 (4, 1, 17)":
         ("fedguide", FedGuide, {"pretraining": {**OFFLINE, "dice_width": 17}}),
     "prior/experts is float32 (4, 4, 2, 3) instead of float32 (4, 5, 2, 3)": ("fedguide", FedGuide, {"n_experts": 5}),
