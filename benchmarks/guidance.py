@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from curves import Curve
 from record import write_result
 
 import fed_envs
-from sb3_fedguide.common.evaluation import FederatedEvalCallback, evaluate_federation, evaluation_env
+from sb3_fedguide.common.evaluation import evaluate_federation, evaluation_env
 from sb3_fedguide.common.rollout_buffer import FederatedRolloutBuffer, generalized_advantage
 from sb3_fedguide.common.value_blend import baseline_metrics, optimal_blend
 from sb3_fedguide.offline.data import OfflineData
@@ -30,22 +31,14 @@ from sb3_fedguide.settings.config import parse_params, resolve
 DICE_ROUNDS = (20, 40)
 
 
-class Guidance(FederatedEvalCallback):
+class Guidance(Curve):
     """Curves of the three policies, and the two values' metrics."""
 
     def __init__(self, n_rounds: int) -> None:
-        super().__init__(n_rounds, eval_freq=5, n_episodes=5)
-        self.returns: dict[str, list[tuple[int, list[float]]]] = {"policy": [], "prior": [], "own_head": []}
+        super().__init__(n_rounds)
+        self.returns: dict[str, list[tuple[int, list[float]]]] = {"policy": self.points, "prior": [], "own_head": []}
         self.values: list[dict[str, Any]] = []
         self.dice: Any = None
-
-    def is_due(self, round: int) -> bool:
-        return round % self.eval_freq == 0
-
-    def _evaluate(self, policy: str, round: int) -> Any:
-        evaluation = super()._evaluate(policy, round)
-        self.returns["policy"].append((round, evaluation.client_returns.round(2).tolist()))
-        return evaluation
 
     def _on_local_training_end(self) -> None:
         super()._on_local_training_end()

@@ -11,36 +11,25 @@ from __future__ import annotations
 import argparse
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch as th
+from curves import Curve
 from record import write_result
 
 import fed_envs
-from sb3_fedguide.common.evaluation import FederatedEvalCallback
 from sb3_fedguide.offline.make_dataset import make_dataset
 from sb3_fedguide.settings.config import resolve
 
 SHOWN = ("prior/effective_sample_share", "prior/prior_loss", "server/effective_experts", "server/head_agreement", "dice/beta")
 
 
-class Log(FederatedEvalCallback):
+class Log(Curve):
     """The curve, and what the log said of the guidance in each round."""
 
     def __init__(self, n_rounds: int) -> None:
         super().__init__(n_rounds, eval_freq=max(1, n_rounds // 20), n_episodes=10)
-        self.curve: list[tuple[int, list[float]]] = []
         self.figures: list[dict[str, float]] = []
-
-    def is_due(self, round: int) -> bool:
-        return round % self.eval_freq == 0 or round == self.n_rounds
-
-    def _evaluate(self, policy: str, round: int) -> Any:
-        evaluation = super()._evaluate(policy, round)
-        if policy == "deployed":
-            self.curve.append((round, evaluation.client_returns.round(4).tolist()))
-        return evaluation
 
     def _on_round_end(self) -> None:
         super()._on_round_end()
@@ -79,10 +68,10 @@ def main() -> None:
                     log = Log(n_rounds)
                     model.learn(n_rounds * model.n_clients * model.rollout_size, log)
                     runs.append({
-                        "algo": algo, "misled": misled, "seed": seed, "curve": log.curve,
+                        "algo": algo, "misled": misled, "seed": seed, "curve": log.points,
                         "log": {"first": log.figures[0], "last": log.figures[-1]},
                     })  # fmt: skip
-                    print(algo, misled, seed, np.round(log.curve[-1][1], 2), log.figures[-1], flush=True)
+                    print(algo, misled, seed, np.round(log.points[-1][1], 2), log.figures[-1], flush=True)
         write_result(f"misleading_priors_{args.env}", {"env": args.env, "runs": runs})
 
 

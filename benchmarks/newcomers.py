@@ -17,40 +17,19 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from curves import Curve
 from record import write_result
 
 import fed_envs
-from sb3_fedguide.common.evaluation import FederatedEvalCallback
 from sb3_fedguide.common.newcomers import start_from
 from sb3_fedguide.settings.config import resolve
-
-
-class Curve(FederatedEvalCallback):
-    """Each client's return at every evaluation, before the first round as well."""
-
-    def __init__(self, n_rounds: int) -> None:
-        super().__init__(n_rounds, eval_freq=2, n_episodes=5)
-        self.points: list[tuple[int, list[float]]] = []
-
-    def is_due(self, round: int) -> bool:
-        return round % self.eval_freq == 0
-
-    def _on_training_start(self) -> None:
-        super()._on_training_start()
-        self._evaluate("deployed", 0)
-
-    def _evaluate(self, policy: str, round: int) -> Any:
-        evaluation = super()._evaluate(policy, round)
-        if policy == "deployed":
-            self.points.append((round, evaluation.client_returns.round(2).tolist()))
-        return evaluation
 
 
 def train(algo: str, family: Any, clients: list[int], seed: int, rounds: int, path: str | None = None, **more: Any) -> Any:
     model = resolve(algo, family, overrides=more).make(family, clients=clients, seed=seed, device="cpu", verbose=0)
     if path is not None:
         start_from(model, path)
-    curve = Curve(rounds)
+    curve = Curve(rounds, eval_freq=2, start=True)
     model.learn(rounds * model.n_clients * model.rollout_size, curve)
     return model, curve.points
 
@@ -85,7 +64,7 @@ def main() -> None:
             "rounds_joined": rounds_to(joined, level), "rounds_alone": rounds_to(alone, level),
         })  # fmt: skip
         print(json.dumps({key: runs[-1][key] for key in ("seed", "level", "rounds_joined", "rounds_alone")}), flush=True)
-    write_result(f"newcomers_{args.env}", {"env": args.env, "before": args.before, "runs": runs})
+        write_result(f"newcomers_{args.env}", {"env": args.env, "before": args.before, "runs": runs})
 
 
 if __name__ == "__main__":

@@ -19,28 +19,26 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from curves import Curve
 from record import write_result
 
 import fed_envs
-from sb3_fedguide.common.evaluation import FederatedEvalCallback, evaluate_federation, evaluation_env
+from sb3_fedguide.common.evaluation import evaluate_federation, evaluation_env
 from sb3_fedguide.server.ot_moe import farthest_points, sinkhorn_plan
 from sb3_fedguide.settings.config import resolve
 
 EVERY, EPISODES, SPLIT = 5, 3, 5
 
 
-class Routing(FederatedEvalCallback):
+class Routing(Curve):
     """The server and the clients' tests in one callback."""
 
     def __init__(self, n_rounds: int, n_experts: int, until: int, eta: float, server_step: float) -> None:
-        super().__init__(n_rounds, eval_freq=5, n_episodes=5)
+        super().__init__(n_rounds)
         self.n_experts, self.until, self.eta, self.server_step = n_experts, until, eta, server_step
         self.curve: list[tuple[float, list[float]]] = []
         self.plans: list[list[list[float]]] = []
         self.test_steps = 0
-
-    def is_due(self, round: int) -> bool:
-        return round % self.eval_freq == 0
 
     def _on_training_start(self) -> None:
         super()._on_training_start()

@@ -13,30 +13,13 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from curves import Curve
 from record import write_result
 
 import fed_envs
-from sb3_fedguide.common.evaluation import FederatedEvalCallback
 from sb3_fedguide.settings.config import resolve
 
 EVERY = 10
-
-
-class Curve(FederatedEvalCallback):
-    """Each client's return after the rounds in which all take part."""
-
-    def __init__(self, n_rounds: int, every: int) -> None:
-        super().__init__(n_rounds, eval_freq=every, n_episodes=10)
-        self.points: list[tuple[int, list[float]]] = []
-
-    def is_due(self, round: int) -> bool:
-        return round % self.eval_freq == 0
-
-    def _evaluate(self, policy: str, round: int) -> Any:
-        evaluation = super()._evaluate(policy, round)
-        if policy == "deployed":
-            self.points.append((round, evaluation.client_returns.round(2).tolist()))
-        return evaluation
 
 
 def federated(family: Any, poor: list[int], seed: int, rounds: int) -> list[tuple[int, list[float]]]:
@@ -47,7 +30,7 @@ def federated(family: Any, poor: list[int], seed: int, rounds: int) -> list[tupl
     )
     few = np.array([client not in poor for client in range(n_clients)])
     model._draw_participants = lambda: model.take_part(np.ones_like(few) if model.round % EVERY == EVERY - 1 else few)
-    curve = Curve(rounds, EVERY)
+    curve = Curve(rounds, EVERY, n_episodes=10)
     steps = (few.sum() * rounds + len(poor) * (rounds // EVERY)) * model.rollout_size
     model.learn(int(steps), curve)
     return curve.points
@@ -55,7 +38,7 @@ def federated(family: Any, poor: list[int], seed: int, rounds: int) -> list[tupl
 
 def alone(family: Any, poor: list[int], seed: int, rounds: int) -> list[tuple[int, list[float]]]:
     model = resolve("local", family).make(family, clients=poor, seed=seed, device="cpu", verbose=0)
-    curve = Curve(rounds, 1)
+    curve = Curve(rounds, 1, n_episodes=10)
     model.learn(rounds * len(poor) * model.rollout_size, curve)
     return curve.points
 

@@ -231,7 +231,7 @@ def test_files_hold_what_a_constructor_sets_and_what_is_an_attributes_own(tmp_pa
     trained.learn(16 * 4)
     trained.late[:] = 1
     before = {name: array.copy() for name, array in trained.parameter_arrays().items()}
-    with pytest.raises(ValueError, match=r"late would have to begin anew.* hold\(\)"):
+    with pytest.raises(ValueError, match=r"late must be reset.* hold\(\)"):
         trained.import_parameters(tmp_path / "parameters.npz")
     after = trained.parameter_arrays()
     assert before.keys() == after.keys() and all(np.array_equal(array, after[name]) for name, array in before.items())

@@ -39,8 +39,8 @@ Row = dict[str, str]
 
 #: Below the tables on the terminal.
 LEGEND = (
-    "F: client-average return at the end, mean ± deviation over seeds; W: its worst seed; CV: deviation over absolute mean in "
-    "the last rounds, twenty at most"
+    "F: client-average return at the end, mean ± standard deviation over seeds; W: its worst seed; CV: standard deviation "
+    "over absolute mean in the last rounds, twenty at most"
 )
 
 

@@ -183,8 +183,8 @@ class RoundProgressCallback(RoundCallback):
         self.bar = tqdm(total=total, initial=done, desc=type(self.model).__name__, unit="round", dynamic_ncols=True)
 
     def _on_round_end(self) -> None:
-        told = shown(self.model.mean_episode_return())
-        self.bar.set_postfix_str(f"training return {told}, sampled actions", refresh=False)
+        mean_return = shown(self.model.mean_episode_return())
+        self.bar.set_postfix_str(f"training return {mean_return}, sampled actions", refresh=False)
         self.bar.update()
 
     def _on_training_end(self) -> None:

@@ -42,13 +42,13 @@ SETTINGS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Normalization:
-    """``clip((obs - mean) / deviation, -clip, clip)`` of flattened observations, in float64.
+    """``clip((obs - mean) / std, -clip, clip)`` of flattened observations, in float64.
 
-    :param mean: ``(obs_dim,)``, like ``deviation``
+    :param mean: ``(obs_dim,)``, like ``std``
     """
 
     mean: np.ndarray
-    deviation: np.ndarray
+    std: np.ndarray
     clip: float
 
     @classmethod
@@ -154,10 +154,10 @@ def features_extractor(space: spaces.Space, normalization: Normalization | None)
     if normalization is not None:
         # As attributes of the class, not of its instances, the constants stay on the CPU, and so load everywhere.
         root.register_buffer("mean", th.as_tensor(normalization.mean))
-        root.register_buffer("deviation", th.as_tensor(normalization.deviation))
+        root.register_buffer("std", th.as_tensor(normalization.std))
         device = graph.call_function(getattr, (features, "device"))
-        mean, deviation = (graph.call_method("to", (graph.get_attr(name), device)) for name in ("mean", "deviation"))
-        scaled = graph.call_function(th.div, (graph.call_function(th.sub, (features, mean)), deviation))
+        mean, std = (graph.call_method("to", (graph.get_attr(name), device)) for name in ("mean", "std"))
+        scaled = graph.call_function(th.div, (graph.call_function(th.sub, (features, mean)), std))
         clipped = graph.call_function(th.clamp, (scaled, -normalization.clip, normalization.clip))
         features = graph.call_method("to", (clipped, th.float32))
     graph.output(features)
@@ -173,7 +173,7 @@ class DeployedPolicy(nn.Module):
     """
 
     mean: th.Tensor
-    deviation: th.Tensor
+    std: th.Tensor
     low: th.Tensor
     high: th.Tensor
 
@@ -194,11 +194,11 @@ class DeployedPolicy(nn.Module):
         self.clip = None if policy.normalization is None else policy.normalization.clip
         if policy.normalization is not None:
             self.register_buffer("mean", th.as_tensor(policy.normalization.mean))
-            self.register_buffer("deviation", th.as_tensor(policy.normalization.deviation))
+            self.register_buffer("std", th.as_tensor(policy.normalization.std))
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         if self.clip is not None:
-            scaled = (observations - self.mean) / self.deviation
+            scaled = (observations - self.mean) / self.std
             observations = th.clamp(scaled, -self.clip, self.clip).to(th.float32)
         actions = self.distribution.decide(self.network(observations))
         if isinstance(self.distribution, Gaussian):

@@ -55,7 +55,7 @@ class Resumable(BaseAlgorithm):
     family: Any
     #: of the resumed run, until its callbacks exist
     _callback_states: Sequence[State] = ()
-    #: what :meth:`hold` was told
+    #: by attribute, the functions given to :meth:`hold`
     _makers: Mapping[str, Callable[[], Any] | None] = MappingProxyType({})
 
     @abstractmethod
@@ -73,16 +73,16 @@ class Resumable(BaseAlgorithm):
         }
 
     def _setup_state(self) -> None:
-        """Say what a model of this method holds with its settings: the last of what ``_setup_model()`` does.
+        """Declare the state of a model with these settings, by :meth:`hold`; the last step of ``_setup_model()``.
 
-        It is called again where training begins and where a state is taken, and leaves alone what is there."""
+        It is called again when training begins and when a state is loaded, and does not change existing state."""
 
     def hold(self, **makers: Callable[[], Any] | None) -> None:
-        """Hold attributes, for :meth:`_setup_state`. One that did not come with a saved model is made when it is first read.
+        """Declare attributes, for :meth:`_setup_state`. If a saved model does not have one, it is made when it is first read.
 
-        :param makers: by attribute, a function that makes what a new model begins with, in its final shapes; ``None`` where
-            the model's settings do without it
-        :raises TypeError: for something else, and for an attribute that the class gives a value
+        :param makers: by attribute, a function that makes its initial value, in its final shapes; ``None`` if the model does
+            not need it with its settings
+        :raises TypeError: for a value instead of a function, and for an attribute with a value in the class
         """
         for name, make in makers.items():
             if make is not None and (not callable(make) or isinstance(make, nn.Module)):
@@ -100,30 +100,30 @@ class Resumable(BaseAlgorithm):
         self._makers = {**self._makers, **makers}
 
     def holds(self, name: str) -> bool:
-        """Whether there is something in an attribute, or will be when it is first read."""
+        """Whether an attribute has a value, or will have one when it is first read."""
         return self._makers.get(name) is not None or recursive_getattr(self, name, None) is not None
 
     def begin_anew(self, names: Iterable[str]) -> None:
-        """Let attributes be what :meth:`hold` makes of them.
+        """Reset attributes to their initial values from :meth:`hold`.
 
-        :raises ValueError: for those that :meth:`hold` does not know; then all stay as they are
+        :raises ValueError: for attributes without an initial value; then none is reset
         """
         names = list(names)
         unknown = [name for name in names if self._makers.get(name) is None]
         if unknown:
             raise ValueError(
-                f"{', '.join(unknown)} would have to begin anew, and {type(self).__name__} does not say how: give hold() a "
+                f"{', '.join(unknown)} must be reset, but {type(self).__name__} has no initial value for it: give hold() a "
                 "function that makes it, in _setup_state()"
             )
         for name in names:
             vars(self).pop(name, None)
 
-    if not TYPE_CHECKING:  # where it would vouch for attributes that nobody has
+    if not TYPE_CHECKING:  # a type checker would accept every attribute
 
         def __getattr__(self, name: str) -> Any:
             make = self._makers.get(name)
             if make is None:
-                return object.__getattribute__(self, name)  # raises what says that there is none
+                return object.__getattribute__(self, name)  # raises AttributeError
             value = make()
             setattr(self, name, value)
             return value
@@ -133,7 +133,7 @@ class Resumable(BaseAlgorithm):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        if "policy" in state:  # _setup_model() has been there
+        if "policy" in state:  # saved after _setup_model()
             self._setup_state()
 
     def save_state(self) -> State:

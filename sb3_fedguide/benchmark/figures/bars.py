@@ -120,7 +120,7 @@ def draw_cv(comparison: Comparison) -> Figure:
     for axes, (family, groups) in zip(grid, values.items(), strict=True):
         _bars(axes, {name: float(np.mean(found)) for name, found in groups.items()}, groups, comparison[family])
         axes.set_title(family, fontsize=MEDIUM, loc="left")
-        axes.set_xlabel(f"CV: deviation over absolute mean of the\nclient-average return, last {LAST_ROUNDS} rounds",
+        axes.set_xlabel(f"CV: standard deviation over absolute mean of the\nclient-average return, last {LAST_ROUNDS} rounds",
                         fontsize=MEDIUM)  # fmt: skip
     legend(figure, _marks([("one seed", _DOT)]), "bar: mean over seeds\nshorter: steadier")
     return figure
