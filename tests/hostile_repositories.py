@@ -1,4 +1,4 @@
-"""Repositories of the hub that a hostile user could make, for :mod:`tests.test_hub`, and how ``fedguide pull`` refuses them."""
+"""Hostile repositories of the hub for :mod:`tests.test_hub`, and how ``fedguide pull`` refuses them."""
 
 from __future__ import annotations
 
