@@ -17,7 +17,8 @@ from stable_baselines3.common import monitor
 from stable_baselines3.common.monitor import Monitor
 
 from fed_envs.faults import ClientError, ContractError, RowError
-from fed_envs.state import State, gives_state
+from fed_envs.plain_data import State
+from fed_envs.state import gives_state
 from fed_envs.world import Batch, Runner, run_here
 
 logger = logging.getLogger(__name__)

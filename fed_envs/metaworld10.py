@@ -19,8 +19,8 @@ from metaworld.policies import ENV_POLICY_MAP
 from fed_envs.clients import MetaWorldClient
 from fed_envs.metadata import Family
 from fed_envs.mujoco_world import MujocoClientEnv
+from fed_envs.plain_data import freeze, thaw
 from fed_envs.seeding import stream
-from fed_envs.state import freeze, thaw
 from fed_envs.world import Batch, Runner, ScriptedPolicy, run_here
 
 OBSERVATION_DIM = 39

@@ -13,9 +13,7 @@ from gymnasium.spaces import Space
 
 from fed_envs.plain_data import State, freeze, generator, thaw
 
-__all__ = [
-    "State", "attributes", "freeze", "generator", "gives_state", "load_state", "save_state", "set_attributes", "thaw",
-]  # fmt: skip
+__all__ = ["attributes", "gives_state", "load_state", "save_state", "set_attributes"]
 
 #: Attributes of Gymnasium's classes (and the file of SB3's Monitor) that are not state.
 IDENTITY = (

@@ -32,9 +32,10 @@ from fed_envs.factories import (
 )
 from fed_envs.faults import ClientError, ContractError, RowError, run_rows, watched
 from fed_envs.metadata import Family, load_family
+from fed_envs.plain_data import State
 from fed_envs.registration import environment_class
 from fed_envs.seeding import integer_seed
-from fed_envs.state import State, load_state, save_state
+from fed_envs.state import load_state, save_state
 from fed_envs.world import Batch, action_dtype
 
 #: Waking a thread costs about as much as five simulator steps, so each thread gets at least this many environments.

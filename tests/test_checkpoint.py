@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import sb3_fedguide.common.checkpoint as checkpoint_module
-from fed_envs.state import freeze, thaw
+from fed_envs.plain_data import freeze, thaw
 from sb3_fedguide import FedAvg
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import (

@@ -13,7 +13,8 @@ from stable_baselines3.common.monitor import Monitor
 import fed_envs
 from fed_envs import FederatedVecEnv
 from fed_envs.metadata import Family, parse_family
-from fed_envs.state import freeze, generator, gives_state, load_state, save_state, thaw
+from fed_envs.plain_data import freeze, generator, thaw
+from fed_envs.state import gives_state, load_state, save_state
 from tests.environments import CountingEnv, PointEnv
 
 #: An episode's steps here, and the steps before the state is taken: in mid-episode, but for the one-step bandit.

@@ -131,3 +131,13 @@ def test_test_modules_do_not_import_each_other() -> None:
                 names = [alias.name for alias in node.names]
             for name in names:
                 assert not any(part.startswith("test_") for part in name.split(".")), f"{path.name} imports {name}"
+
+
+def test_plain_data_has_one_import_path() -> None:
+    from fed_envs import plain_data, state
+
+    assert not set(state.__all__) & set(vars(plain_data))
+    for path in [*(ROOT / "sb3_fedguide").rglob("*.py"), *(ROOT / "fed_envs").glob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module == "fed_envs.state":
+                assert {alias.name for alias in node.names} <= {*state.__all__, "IDENTITY"}, path

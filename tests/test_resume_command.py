@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import yaml
 
-from fed_envs.state import freeze
+from fed_envs.plain_data import freeze
 from sb3_fedguide.cli.run_folder import exclusive
 from sb3_fedguide.cli.train import main
 from sb3_fedguide.common.checkpoint import checkpoints

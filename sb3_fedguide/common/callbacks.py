@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 from tqdm.auto import tqdm
 
-from fed_envs.state import State
+from fed_envs.plain_data import State
 from sb3_fedguide.common.digits import shown
 from sb3_fedguide.server.rounds import Coordinator
 from sb3_fedguide.state.held import load_held, save_held

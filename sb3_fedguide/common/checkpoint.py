@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
-from fed_envs.state import State
+from fed_envs.plain_data import State
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.state.checkpoint_files import (
     KEPT,

@@ -12,7 +12,7 @@ import numpy as np
 from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
 from fed_envs.files import GrowingTable
-from fed_envs.state import State, freeze, thaw
+from fed_envs.plain_data import State, freeze, thaw
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.episodes import truth
 from sb3_fedguide.seeding import EVALUATION_SEED, Role

@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer, ReplayBuffer
 
-from fed_envs.state import State
+from fed_envs.plain_data import State
 from sb3_fedguide.common.normalization import FederatedNormalizer
 
 _ARRAYS = ("observations", "next_observations", "actions", "rewards", "terminations")

@@ -15,7 +15,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from torch import nn
 
 from fed_envs import FederatedVecEnv
-from fed_envs.state import State, freeze, thaw
+from fed_envs.plain_data import State, freeze, thaw
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.checkpoint import CheckpointError, newest_checkpoint
 from sb3_fedguide.common.normalization import FederatedNormalizer

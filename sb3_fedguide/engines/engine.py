@@ -10,7 +10,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 
 from fed_envs.faults import ClientError
-from fed_envs.state import State
+from fed_envs.plain_data import State
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.common.faults import warn_of_new_episodes
 from sb3_fedguide.common.federation import Federation

@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import Logger
 
 from fed_envs import FederatedVecEnv
 from fed_envs.faults import ClientError
-from fed_envs.state import State
+from fed_envs.plain_data import State
 from sb3_fedguide.common.federation import Federation
 from sb3_fedguide.state.held import held_by
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from fed_envs.files import GrowingTable
-from fed_envs.state import State
+from fed_envs.plain_data import State
 from sb3_fedguide.common.callbacks import RoundCallback
 from sb3_fedguide.monitoring.charts import flat
 from sb3_fedguide.server.ot_moe import OTMoE

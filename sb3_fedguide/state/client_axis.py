@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fed_envs.plain_data import TAG
-from fed_envs.state import State
+from fed_envs.plain_data import TAG, State
 
 __all__ = ["join_clients", "take_clients"]
 
